@@ -1,0 +1,1 @@
+"""ROS messages to numpy and back: pure functions, no rclpy, no SLAM."""

@@ -1,0 +1,235 @@
+"""Pinhole cameras, their calibration, and turning recorded images into frames.
+
+A pixel's centre is its integer index, everywhere. Resizing by ``s`` therefore maps
+``f' = s f`` and ``c' = (c + 0.5) s - 0.5``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from splatam_core.errors import CameraError, FrameError
+from splatam_core.types import RgbdFrame
+
+DISTORTION_COEFFICIENTS = {
+    'none': (0,),
+    'plumb_bob': (4, 5),
+    'rational_polynomial': (8,),
+    'equidistant': (4,),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class PinholeCamera:
+    """An ideal camera: size and focal lengths in pixels, principal point in pixel indices."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise CameraError(f'camera size {self.width}x{self.height}: both must be at least 1 pixel')
+        if not (np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() and self.fx > 0 and self.fy > 0):
+            raise CameraError(
+                f'camera intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}: focal lengths must be '
+                'positive and all four finite; is the camera calibrated?'
+            )
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The intrinsic matrix K, [3, 3]."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
+
+    def resized(self, width: int, height: int) -> PinholeCamera:
+        """The camera of the same image resampled to another size."""
+        sx, sy = width / self.width, height / self.height
+        return PinholeCamera(
+            width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
+        )
+
+
+class Intrinsics(Protocol):
+    """Whatever states a camera: a CameraInfo adapter's result, a ``camera.yaml``."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion_model: str
+    distortion: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCalibration:
+    """A real camera: a pinhole and how its lens departs from one (OpenCV's coefficient order)."""
+
+    pinhole: PinholeCamera
+    distortion_model: str = 'none'
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        allowed = DISTORTION_COEFFICIENTS.get(self.distortion_model)
+        if allowed is None:
+            raise CameraError(
+                f"distortion model '{self.distortion_model}' is not one of {', '.join(DISTORTION_COEFFICIENTS)}"
+            )
+        if self.is_distorted and len(self.distortion) not in allowed:
+            raise CameraError(
+                f'{self.distortion_model} takes {" or ".join(map(str, allowed))} coefficients, '
+                f'got {len(self.distortion)}'
+            )
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether any coefficient bends a ray."""
+        return any(self.distortion)
+
+    @classmethod
+    def from_intrinsics(cls, intrinsics: Intrinsics) -> CameraCalibration:
+        """The calibration a camera states about itself."""
+        i = intrinsics
+        pinhole = PinholeCamera(i.width, i.height, i.fx, i.fy, i.cx, i.cy)
+        return cls(pinhole, i.distortion_model, tuple(i.distortion))
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFile:
+    """What a ``camera.yaml`` beside a recording states.
+
+    Attributes:
+        calibration: the camera.
+        depth_scale: stored depth counts per metre; None where the file does not say.
+    """
+
+    calibration: CameraCalibration
+    depth_scale: float | None
+
+
+def read_camera_file(path: Path) -> CameraFile:
+    """Read ``width height fx fy cx cy distortion_model distortion depth_scale`` from a YAML file.
+
+    Raises:
+        CameraError: the file is no such mapping, or a key is missing, unknown or not a number.
+    """
+    try:
+        values = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise CameraError(f'{path}: cannot be read: {error}') from None
+    if not isinstance(values, dict):
+        raise CameraError(f'{path}: expected a mapping with width, height, fx, fy, cx, cy')
+    required = {'width', 'height', 'fx', 'fy', 'cx', 'cy'}
+    optional = {'distortion_model', 'distortion', 'depth_scale'}
+    if missing := required - values.keys():
+        raise CameraError(f'{path}: missing {", ".join(sorted(missing))}')
+    if unknown := values.keys() - required - optional:
+        raise CameraError(f'{path}: unknown {", ".join(sorted(map(str, unknown)))}')
+    try:
+        return _camera_file(values)
+    except (TypeError, ValueError) as error:
+        raise CameraError(f'{path}: {error}') from None
+    except CameraError as error:
+        raise CameraError(f'{path}: {error}') from None
+
+
+def _camera_file(values: dict[str, Any]) -> CameraFile:
+    pinhole = PinholeCamera(
+        int(values['width']), int(values['height']), *(float(values[key]) for key in ('fx', 'fy', 'cx', 'cy'))
+    )
+    distortion = tuple(float(value) for value in values.get('distortion') or ())
+    scale = values.get('depth_scale')
+    if scale is not None and not float(scale) > 0:
+        raise CameraError(f'depth_scale {scale} must be positive (counts per metre)')
+    model = values.get('distortion_model') or 'none'
+    return CameraFile(CameraCalibration(pinhole, model, distortion), None if scale is None else float(scale))
+
+
+@dataclass(frozen=True)
+class FrameFactory:
+    """Makes frames of one ideal camera out of one real camera's images.
+
+    Rectifies (colour bilinear, depth nearest) and resizes (colour by area when shrinking, depth
+    nearest). Depth is measured along the optical axis, so rectification moves it but keeps its value.
+
+    Attributes:
+        calibration: the camera that took the images.
+        width: width of the frames in pixels; None keeps the recorded size. Height follows the aspect.
+    """
+
+    calibration: CameraCalibration
+    width: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.width is not None and self.width < 16:
+            raise CameraError(f'width {self.width}: frames must be at least 16 pixels wide')
+
+    @cached_property
+    def camera(self) -> PinholeCamera:
+        """The ideal camera of every frame made here."""
+        pinhole = self.calibration.pinhole
+        if self.width is None or self.width == pinhole.width:
+            return pinhole
+        return pinhole.resized(self.width, max(1, round(pinhole.height * self.width / pinhole.width)))
+
+    @cached_property
+    def _maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        if not self.calibration.is_distorted:
+            return None
+        pinhole = self.calibration.pinhole
+        undistort = (
+            cv2.fisheye.initUndistortRectifyMap
+            if self.calibration.distortion_model == 'equidistant'
+            else cv2.initUndistortRectifyMap
+        )
+        return undistort(
+            pinhole.matrix, np.array(self.calibration.distortion), np.eye(3), pinhole.matrix,
+            (pinhole.width, pinhole.height), cv2.CV_32FC1,
+        )  # fmt: skip
+
+    def make(self, stamp_ns: int, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> RgbdFrame:
+        """Make one frame.
+
+        Args:
+            stamp_ns: time of the exposure.
+            rgb: [H, W, 3] in the recorded size.
+            depth_m: [H, W] metres, registered to colour; 0, NaN and inf are no reading.
+
+        Raises:
+            FrameError: an image has another size than the calibration.
+        """
+        pinhole = self.calibration.pinhole
+        expected = (pinhole.height, pinhole.width)
+        for name, image in (('colour', rgb), ('depth', depth_m)):
+            if image.shape[:2] != expected:
+                raise FrameError(
+                    f'{name} image is {image.shape[1]}x{image.shape[0]} but the camera is calibrated for '
+                    f'{pinhole.width}x{pinhole.height}; colour, depth and camera must be registered to each other'
+                )
+        if self._maps is not None:
+            rgb = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR)
+            depth_m = cv2.remap(depth_m, *self._maps, cv2.INTER_NEAREST)
+        size = (self.camera.width, self.camera.height)
+        if size != (pinhole.width, pinhole.height):
+            shrinking = size[0] < pinhole.width
+            rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)
+            depth_m = _resize_nearest(depth_m, size)
+        depth_m = np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(0)).astype(np.float32)
+        return RgbdFrame(stamp_ns, np.ascontiguousarray(rgb), depth_m, self.camera)
+
+
+def _resize_nearest(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """Nearest by pixel centres; cv2.INTER_NEAREST rounds the corner instead and shifts by half a pixel."""
+    return cv2.resize(image, size, interpolation=cv2.INTER_NEAREST_EXACT)

@@ -1,0 +1,29 @@
+"""The errors a user can cause. Anything else that is raised is a bug and keeps its traceback."""
+
+
+class SplatamError(Exception):
+    """Base of every error a user can cause: what, the value, what is allowed, what to do."""
+
+
+class ConfigError(SplatamError):
+    """A configuration file, key or value that cannot be used."""
+
+
+class CameraError(SplatamError):
+    """A camera calibration that cannot be used."""
+
+
+class DatasetError(SplatamError):
+    """A recording that cannot be read as the format it was taken for."""
+
+
+class FrameError(SplatamError):
+    """One frame that cannot be processed; the frames after it may be fine."""
+
+
+class RunFolderError(SplatamError):
+    """A run folder that cannot be written, read or scored."""
+
+
+class RasterizerError(SplatamError):
+    """A rasterizer backend that is missing, or was given what it cannot render."""
