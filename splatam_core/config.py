@@ -1,0 +1,303 @@
+"""The one configuration: typed, with help, unit and bounds beside each default.
+
+Order: defaults < preset < overrides. YAML files, ``--set``, ROS parameters and the documentation's
+table all derive from the dataclasses below.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, Union, get_type_hints
+
+import yaml
+
+from splatam_core.errors import ConfigError
+from splatam_core.resources import config_dir
+
+Value = Union[bool, int, float, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One leaf of the configuration.
+
+    Attributes:
+        name: dotted path, e.g. ``tracking.iterations``.
+        type: bool, int, float or str.
+        default: value where neither preset nor user says otherwise.
+        help: what it does, one sentence.
+        unit: of the value; empty where it has none.
+        minimum: smallest allowed number, or None.
+        maximum: largest allowed number, or None.
+        choices: the allowed strings; empty where any will do.
+    """
+
+    name: str
+    type: type
+    default: Value
+    help: str
+    unit: str
+    minimum: float | None
+    maximum: float | None
+    choices: tuple[str, ...]
+
+    def check(self, value: object) -> Value:
+        """The value in this setting's type.
+
+        Raises:
+            ConfigError: wrong type, or outside what is allowed.
+        """
+        if self.type is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if type(value) is not self.type:
+            raise ConfigError(f'{self.name} = {value!r}: expected {self._allowed()}')
+        if self.choices and value not in self.choices:
+            raise ConfigError(f'{self.name} = {value!r}: expected {self._allowed()}')
+        too_low = self.minimum is not None and not value >= self.minimum
+        too_high = self.maximum is not None and not value <= self.maximum
+        if too_low or too_high:
+            raise ConfigError(f'{self.name} = {value}: expected {self._allowed()}')
+        return value
+
+    def _allowed(self) -> str:
+        if self.choices:
+            return 'one of ' + ', '.join(self.choices)
+        kind = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'a text'}[self.type]
+        bounds = [f'at least {self.minimum:g}'] if self.minimum is not None else []
+        bounds += [f'at most {self.maximum:g}'] if self.maximum is not None else []
+        return ' '.join([kind, ' and '.join(bounds), f'({self.unit})' if self.unit else '']).strip()
+
+
+def _setting(
+    default: Value,
+    help: str,
+    unit: str = '',
+    minimum: float | None = None,
+    maximum: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    metadata = {'help': help, 'unit': unit, 'minimum': minimum, 'maximum': maximum, 'choices': choices}
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True, slots=True)
+class DepthConfig:
+    """Which depth readings count."""
+
+    min_m: float = _setting(0.2, 'Nearer readings count as none.', 'm', 0.0)
+    max_m: float = _setting(100.0, 'Farther readings count as none.', 'm', 0.0)
+    edge_filter: float = _setting(
+        0.0, 'Drop readings that differ from a neighbour by more than this share of their depth; 0 = off.', '', 0.0, 1.0
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingConfig:
+    """Camera tracking (paper, section 3.2), and when to call a frame lost."""
+
+    iterations: int = _setting(40, 'Optimisation steps per frame.', '', 0)
+    rotation_rate: float = _setting(4e-4, 'Adam step of the unit quaternion.', '', 0.0)
+    translation_rate: float = _setting(2e-3, 'Adam step of the translation.', 'm', 0.0)
+    color_weight: float = _setting(0.5, 'Weight of the colour L1.', '', 0.0)
+    depth_weight: float = _setting(1.0, 'Weight of the depth L1.', '', 0.0)
+    silhouette_threshold: float = _setting(
+        0.99, 'Pixels count only where the rendered silhouette is above this.', '', 0.0, 1.0
+    )
+    motion_model: str = _setting(
+        'constant_velocity', 'Where tracking starts from.', choices=('constant_velocity', 'last_pose')
+    )
+    min_sure_fraction: float = _setting(
+        0.2, 'Lost when a smaller share of the pixels with depth sees sure map.', '', 0.0, 1.0
+    )
+    min_inlier_fraction: float = _setting(
+        0.5, 'Lost when a smaller share of those pixels agrees with the map in depth and colour.', '', 0.0, 1.0
+    )
+    inlier_depth: float = _setting(0.05, 'Agreeing depth differs by at most this share of the reading.', '', 0.0)
+    inlier_color: float = _setting(0.2, 'Agreeing colour differs by at most this, mean over channels in [0, 1].', '', 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class DensificationConfig:
+    """Where a frame adds Gaussians (paper, section 3.3)."""
+
+    scale: float = _setting(1.0, 'Resolution at which Gaussians are added, relative to the frame.', '', 0.05, 1.0)
+    silhouette_threshold: float = _setting(0.5, 'Add where the silhouette is below this.', '', 0.0, 1.0)
+    depth_error_ratio: float = _setting(
+        50.0, 'Also add where the reading is in front of the map by more than this many median errors.', '', 0.0
+    )
+    opacity: float = _setting(0.5, 'Opacity of a new Gaussian.', '', 0.01, 0.99)
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeConfig:
+    """Which frames are kept, and which of them are mapped together (paper, section 3.4)."""
+
+    every: int = _setting(5, 'Keep every n-th frame.', 'frames', 1)
+    window: int = _setting(24, 'Views in a mapping window, the current frame included.', 'frames', 1)
+    overlap_samples: int = _setting(1600, 'Pixels sampled to measure overlap with a keyframe.', 'px', 1)
+    overlap_margin: int = _setting(20, 'Border of a keyframe in which a sample does not count as seen.', 'px', 0)
+
+
+@dataclass(frozen=True, slots=True)
+class MappingConfig:
+    """Map refinement and pruning (paper, section 3.4)."""
+
+    mode: str = _setting('sync', 'Map inside each frame.', choices=('sync',))
+    every: int = _setting(1, 'Densify and refine on every n-th frame.', 'frames', 1)
+    iterations: int = _setting(60, 'Optimisation steps per mapped frame.', '', 0)
+    color_weight: float = _setting(0.5, 'Weight of the colour loss.', '', 0.0)
+    depth_weight: float = _setting(1.0, 'Weight of the depth L1.', '', 0.0)
+    ssim_weight: float = _setting(0.2, 'Share of 1 - SSIM in the colour loss; the rest is L1.', '', 0.0, 1.0)
+    means_rate: float = _setting(1e-4, 'Adam step of the centres.', 'm', 0.0)
+    rgb_rate: float = _setting(2.5e-3, 'Adam step of the colours.', '', 0.0)
+    opacity_rate: float = _setting(0.05, 'Adam step of the opacity logits.', '', 0.0)
+    scale_rate: float = _setting(1e-3, 'Adam step of the log scales.', '', 0.0)
+    prune_every: int = _setting(20, 'Prune before every n-th step of a frame; 0 = never.', 'steps', 0)
+    prune_until: int = _setting(20, 'Last step of a frame that may prune.', 'steps', 0)
+    prune_opacity: float = _setting(0.005, 'Prune Gaussians fainter than this.', '', 0.0, 1.0)
+    prune_scale: float = _setting(0.1, 'Prune Gaussians wider than this share of the scene radius.', '', 0.0)
+    scene_radius_ratio: float = _setting(3.0, 'Scene radius = deepest reading of the first frame / this.', '', 0.1)
+
+
+@dataclass(frozen=True, slots=True)
+class SlamConfig:
+    """Everything that can be set about SLAM. The defaults are the paper's for Replica."""
+
+    seed: int = _setting(0, 'Seed of every random choice.', '', 0)
+    threads: int = _setting(0, 'CPU threads; 0 = all cores, 1 = repeatable bit for bit.', '', 0, 256)
+    rasterizer: str = _setting('cpu', 'Rasterizer backend.', choices=('cpu', 'reference'))
+    depth: DepthConfig = field(default_factory=DepthConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    densification: DensificationConfig = field(default_factory=DensificationConfig)
+    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    mapping: MappingConfig = field(default_factory=MappingConfig)
+
+
+def settings() -> list[Setting]:
+    """Every leaf of the configuration, in order."""
+    return list(_settings(SlamConfig, ''))
+
+
+def _settings(section: type, prefix: str) -> Iterator[Setting]:
+    hints = get_type_hints(section)
+    for entry in fields(section):
+        if is_dataclass(hints[entry.name]):
+            yield from _settings(hints[entry.name], f'{prefix}{entry.name}.')
+        else:
+            yield Setting(f'{prefix}{entry.name}', hints[entry.name], entry.default, **entry.metadata)
+
+
+def preset_names() -> list[str]:
+    """The presets that ship."""
+    return sorted(path.stem for path in (config_dir() / 'presets').glob('*.yaml'))
+
+
+def load_config(preset: str | None = None, overrides: Mapping[str, object] | Iterable[str] = ()) -> SlamConfig:
+    """Defaults, changed by a preset, changed by overrides.
+
+    Args:
+        preset: a shipped preset's name, or the path of a YAML file.
+        overrides: dotted names to values, or texts ``name=value``.
+
+    Raises:
+        ConfigError: an unknown preset or key, or a value that is not allowed.
+    """
+    values = {} if preset is None else _flatten(_read_preset(preset), '')
+    values |= overrides if isinstance(overrides, Mapping) else dict(map(_parse_override, overrides))
+    return with_values(SlamConfig(), values)
+
+
+def with_values(config: SlamConfig, values: Mapping[str, object]) -> SlamConfig:
+    """The configuration with some leaves, named by dotted path, set anew.
+
+    Raises:
+        ConfigError: an unknown name, or a value that is not allowed.
+    """
+    known = {setting.name: setting for setting in settings()}
+    for name, value in values.items():
+        if name not in known:
+            raise ConfigError(_unknown(name, known))
+        config = _replace_leaf(config, name.split('.'), known[name].check(value))
+    if not config.depth.min_m < config.depth.max_m:
+        raise ConfigError(f'depth.min_m = {config.depth.min_m:g}: expected less than depth.max_m = {config.depth.max_m:g}')
+    return config
+
+
+def flat_values(config: SlamConfig) -> dict[str, Value]:
+    """Every leaf's value by its dotted name."""
+    return {setting.name: _leaf(config, setting.name) for setting in settings()}
+
+
+def to_yaml(config: SlamConfig) -> str:
+    """The whole configuration as YAML that ``load_config`` reads back."""
+    tree: dict[str, Any] = {}
+    for name, value in flat_values(config).items():
+        *sections, leaf = name.split('.')
+        branch = tree
+        for section in sections:
+            branch = branch.setdefault(section, {})
+        branch[leaf] = value
+    return yaml.safe_dump(tree, sort_keys=False)
+
+
+def _leaf(config: object, name: str) -> Value:
+    for part in name.split('.'):
+        config = getattr(config, part)
+    return config  # type: ignore[return-value]
+
+
+def _replace_leaf(config: Any, path: list[str], value: Value) -> Any:
+    head, *rest = path
+    return replace(config, **{head: _replace_leaf(getattr(config, head), rest, value) if rest else value})
+
+
+def _read_preset(preset: str) -> dict[str, Any]:
+    path = Path(preset) if preset.endswith(('.yaml', '.yml')) else config_dir() / 'presets' / f'{preset}.yaml'
+    if not path.is_file():
+        raise ConfigError(f"unknown preset '{preset}'; shipped: {', '.join(preset_names())}; or give a .yaml file")
+    try:
+        values = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f'{path}: cannot be read: {error}') from None
+    if not isinstance(values, (dict, type(None))):
+        raise ConfigError(f'{path}: expected a mapping of settings')
+    return values or {}
+
+
+def _flatten(tree: Mapping[str, Any], prefix: str) -> dict[str, object]:
+    flat: dict[str, object] = {}
+    for key, value in tree.items():
+        flat |= _flatten(value, f'{prefix}{key}.') if isinstance(value, Mapping) else {f'{prefix}{key}': value}
+    return flat
+
+
+def _parse_override(text: str) -> tuple[str, object]:
+    name, equals, value = text.partition('=')
+    if not equals:
+        raise ConfigError(f"'{text}': expected key=value, for example tracking.iterations=40")
+    try:
+        return name.strip(), _number(yaml.safe_load(value))
+    except yaml.YAMLError:
+        raise ConfigError(f"'{text}': the value is not valid YAML") from None
+
+
+def _number(value: object) -> object:
+    """YAML 1.1 reads ``1e-3`` as a text; people mean the number."""
+    if isinstance(value, str):
+        try:
+            return float(value)
+        except ValueError:
+            return value
+    return value
+
+
+def _unknown(name: str, known: Mapping[str, Setting]) -> str:
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    if not close:
+        same_leaf = [candidate for candidate in known if candidate.split('.')[-1] == name.split('.')[-1]]
+        close = same_leaf[:1]
+    hint = f"; did you mean '{close[0]}'?" if close else f'; known: {", ".join(known)}'
+    return f"unknown key '{name}'{hint}"
