@@ -25,5 +25,9 @@ class RunFolderError(SplatamError):
     """A run folder that cannot be written, read or scored."""
 
 
+class MapFileError(SplatamError):
+    """A map file that cannot be read, or is no map."""
+
+
 class RasterizerError(SplatamError):
     """A rasterizer backend that is missing, or was given what it cannot render."""

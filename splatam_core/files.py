@@ -1,0 +1,28 @@
+"""Files that are never half there."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """A path beside the given one to write to; it takes its place once the block is through without an error.
+
+    Readers see the old file or the new one, complete, whenever they look and whatever interrupts the writer.
+    """
+    temporary = path.with_name(f'.{path.name}.{os.getpid()}')
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a text file in one step, in place of the one that is there."""
+    with replaced(path) as temporary:
+        temporary.write_text(text, encoding='utf-8')
