@@ -1,0 +1,32 @@
+"""Differentiable rasterizers behind one contract (``base``)."""
+
+from __future__ import annotations
+
+from splatam_core.rasterizer.base import Gaussians, Rasterizer, Render
+
+__all__ = ['Gaussians', 'Rasterizer', 'Render', 'make_rasterizer']
+
+
+def make_rasterizer(name: str, threads: int = 0) -> Rasterizer:
+    """A backend by its name in the configuration.
+
+    Args:
+        name: ``cpu`` or ``reference``.
+        threads: CPU threads; 0 = all cores.
+    """
+    return _BACKENDS[name](threads)
+
+
+def _cpu(threads: int) -> Rasterizer:
+    from splatam_core.rasterizer.cpu import CpuRasterizer
+
+    return CpuRasterizer(threads)
+
+
+def _reference(threads: int) -> Rasterizer:
+    from splatam_core.rasterizer.reference import ReferenceRasterizer
+
+    return ReferenceRasterizer()
+
+
+_BACKENDS = {'cpu': _cpu, 'reference': _reference}

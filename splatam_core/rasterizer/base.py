@@ -1,0 +1,84 @@
+"""The rasterizer contract: one differentiable pass gives colour, depth and silhouette.
+
+A Gaussian at camera coordinates (x, y, z) with radius r and opacity o lands on pixel position
+``u = fx x/z + cx``, ``v = fy y/z + cy`` with variance ``s^2 = (f r/z)^2 + 0.3`` px^2, ``f = (fx + fy)/2``, and
+covers the pixel at distance d with ``alpha = min(0.99, o exp(-d^2 / 2 s^2))``, nothing below 1/255.
+Gaussians are blended front to back by z; a pixel takes no more once its transmittance is below 1e-4.
+Centres at z <= 0.2 m are not drawn. The background is black. Where alpha is clamped it has no gradient.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from splatam_core.camera import PinholeCamera
+
+NEAR_M = 0.2
+BLUR_PX2 = 0.3
+MAX_ALPHA = 0.99
+MIN_ALPHA = 1.0 / 255.0
+MIN_TRANSMITTANCE = 1e-4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gaussians:
+    """What a rasterizer draws.
+
+    Attributes:
+        means: [N, 3] metres, world.
+        log_scales: [N, 1] log metres: isotropic.
+        logit_opacities: [N].
+        rgb: [N, 3], not clamped.
+    """
+
+    means: Tensor
+    log_scales: Tensor
+    logit_opacities: Tensor
+    rgb: Tensor
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def detached(self) -> Gaussians:
+        """The same values, cut off from autograd."""
+        return Gaussians(
+            self.means.detach(), self.log_scales.detach(), self.logit_opacities.detach(), self.rgb.detach()
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Render:
+    """One view of the map.
+
+    Attributes:
+        rgb: [3, H, W].
+        depth_acc: [H, W] metres, sum of w z: short of the surface where the silhouette is below 1.
+        silhouette: [H, W] in [0, 1), sum of w.
+    """
+
+    rgb: Tensor
+    depth_acc: Tensor
+    silhouette: Tensor
+
+    def depth(self, min_silhouette: float = 0.5) -> Tensor:
+        """[H, W] expected depth in metres; 0 where the silhouette is below the limit."""
+        seen = self.silhouette >= min_silhouette
+        return torch.where(seen, self.depth_acc / torch.where(seen, self.silhouette, 1.0), 0.0)
+
+
+class Rasterizer(Protocol):
+    """A backend."""
+
+    def render(self, gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -> Render:
+        """Draw the Gaussians, differentiably in them and in the pose.
+
+        Args:
+            gaussians: what to draw.
+            camera: the image to draw.
+            T_cam_world: [4, 4] world to camera; its upper three rows receive gradients entry by entry.
+        """
+        ...

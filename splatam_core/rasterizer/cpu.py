@@ -1,0 +1,100 @@
+"""The contract on the CPU: native kernels, tiles of 8x8 pixels, gradients written by hand."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatam_core.camera import PinholeCamera
+from splatam_core.errors import RasterizerError
+from splatam_core.rasterizer.base import Gaussians, Render
+
+try:
+    from splatam_core.rasterizer import _native
+except ImportError as error:
+    raise RasterizerError(
+        f"the CPU rasterizer's native module cannot be loaded ({error}); build it with 'pip install .' "
+        "(needs g++ and Python's headers), or use rasterizer=reference"
+    ) from None
+
+
+class CpuRasterizer:
+    """Sorted, tiled, vectorised and threaded.
+
+    With a fixed number of threads results are repeatable bit for bit; images do not depend on it at all.
+    """
+
+    def __init__(self, threads: int = 0) -> None:
+        self._engine = _native.Engine(threads or len(os.sched_getaffinity(0)))
+
+    @property
+    def instruction_set(self) -> str:
+        """The variant of the kernels this processor got."""
+        return self._engine.instruction_set
+
+    def render(self, gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -> Render:
+        """See ``Rasterizer.render``. float32 only."""
+        _check(gaussians, T_cam_world)
+        return Render(
+            *_Splat.apply(
+                gaussians.means.contiguous(), gaussians.log_scales.contiguous(),
+                gaussians.logit_opacities.contiguous(), gaussians.rgb.contiguous(), T_cam_world, self._engine, camera,
+            )
+        )  # fmt: skip
+
+
+def _check(gaussians: Gaussians, T_cam_world: Tensor) -> None:
+    n = len(gaussians)
+    expected = {'means': (n, 3), 'log_scales': (n, 1), 'logit_opacities': (n,), 'rgb': (n, 3)}
+    tensors = {name: getattr(gaussians, name) for name in expected} | {'T_cam_world': T_cam_world}
+    for name, shape in (expected | {'T_cam_world': (4, 4)}).items():
+        tensor = tensors[name]
+        if tensor.shape != shape or tensor.dtype != torch.float32 or tensor.device.type != 'cpu':
+            raise RasterizerError(
+                f'{name} is {tuple(tensor.shape)} {tensor.dtype} on {tensor.device}; '
+                f'the cpu rasterizer takes {shape} float32 on cpu'
+            )
+
+
+class _Splat(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        log_scales: Tensor,
+        logit_opacities: Tensor,
+        rgb: Tensor,
+        T_cam_world: Tensor,
+        engine: _native.Engine,
+        camera: PinholeCamera,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        size = (camera.height, camera.width)
+        images = torch.empty(3, *size), torch.empty(size), torch.empty(size)
+        inputs = means, log_scales, logit_opacities, rgb
+        ctx.view = engine.forward(
+            *(tensor.detach().numpy() for tensor in inputs), T_cam_world.detach().numpy(),
+            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
+            *(image.numpy() for image in images),
+        )  # fmt: skip
+        ctx.engine = engine
+        ctx.save_for_backward(*inputs, *images)
+        return images
+
+    @staticmethod
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+        *inputs, rgb_image, depth_acc, silhouette = ctx.saved_tensors
+        gradients = [
+            torch.zeros_like(tensor) if wanted else None
+            for tensor, wanted in zip(inputs, ctx.needs_input_grad, strict=False)
+        ]
+        pose = torch.zeros(4, 4)
+        ctx.engine.backward(
+            ctx.view, *(tensor.detach().numpy() for tensor in inputs),
+            [image.detach().numpy() for image in (rgb_image, depth_acc, silhouette)],
+            [slope.contiguous().numpy() for slope in slopes],
+            *(None if gradient is None else gradient.numpy() for gradient in gradients), pose.numpy(),
+        )  # fmt: skip
+        return *gradients, pose if ctx.needs_input_grad[4] else None, None, None

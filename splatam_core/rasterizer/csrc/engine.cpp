@@ -1,0 +1,260 @@
+#include "engine.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstring>
+#include <utility>
+
+namespace splatam {
+namespace {
+
+constexpr std::size_t kBlock = 4096;
+constexpr int kDigitBits = 10;  // three digits hold every depth from 0.2 m on
+constexpr std::size_t kDigits = std::size_t(1) << kDigitBits;
+
+std::size_t blocks_of(std::size_t count) { return (count + kBlock - 1) / kBlock; }
+
+// Part `index` of `parts` of a range.
+std::size_t part(std::size_t count, int index, int parts) { return count * std::size_t(index) / std::size_t(parts); }
+
+std::uint32_t depth_bits(float z) {
+  std::uint32_t bits, near;
+  std::memcpy(&bits, &z, sizeof bits);
+  std::memcpy(&near, &kNear, sizeof near);
+  return bits - near;
+}
+
+// Calls visit(tile) for each tile that a splat's disc touches.
+template <typename Visit>
+void visit_tiles(const Splat& s, float reach, const View& view, Visit&& visit) {
+  const float last_y = float(view.camera.height - 1), last_x = float(view.camera.width - 1);
+  const int y0 = int(std::max(0.0f, s.v - reach)) / kTile, y1 = int(std::min(last_y, s.v + reach)) / kTile;
+  for (int y = y0; y <= y1; ++y) {
+    const float top = float(y * kTile), bottom = top + (kTile - 1);
+    const float dy = std::max({0.0f, top - s.v, s.v - bottom});
+    const float half = std::sqrt(std::max(0.0f, reach * reach - dy * dy));
+    const float left = std::max(0.0f, std::ceil(s.u - half)), right = std::min(last_x, std::floor(s.u + half));
+    if (left > right) continue;
+    for (int x = int(left) / kTile; x <= int(right) / kTile; ++x) visit(y * view.tiles_x + x);
+  }
+}
+
+}  // namespace
+
+TileList View::tile(int index) const {
+  const std::size_t begin = tile_begins[index];
+  return {index % tiles_x * kTile, index / tiles_x * kTile, entries.data() + begin, tile_begins[index + 1] - begin};
+}
+
+std::shared_ptr<View> Engine::borrow_view() {
+  std::unique_ptr<View> view;
+  {
+    std::lock_guard<std::mutex> lock(spare_mutex_);
+    if (!spare_.empty()) {
+      view = std::move(spare_.back());
+      spare_.pop_back();
+    }
+  }
+  if (!view) view = std::make_unique<View>();
+  auto engine = shared_from_this();
+  return std::shared_ptr<View>(view.release(), [engine](View* returned) {
+    std::lock_guard<std::mutex> lock(engine->spare_mutex_);
+    engine->spare_.emplace_back(returned);
+  });
+}
+
+std::shared_ptr<View> Engine::forward(const GaussianArrays& gaussians, std::size_t count, const Camera& camera,
+                                      const Pose& pose, const Images& images) {
+  std::lock_guard<std::mutex> lock(mutex_);
+  auto view = borrow_view();
+  view->camera = camera;
+  view->pose = pose;
+  view->num_gaussians = count;
+  view->tiles_x = (camera.width + kTile - 1) / kTile;
+  view->tiles_y = (camera.height + kTile - 1) / kTile;
+  project(*view, gaussians);
+  sort_by_depth(*view);
+  list_tiles(*view);
+  blend(*view, images);
+  return view;
+}
+
+void Engine::project(View& view, const GaussianArrays& gaussians) {
+  const std::size_t count = view.num_gaussians, blocks = blocks_of(count);
+  view.splats.resize(count);
+  view.reach.resize(count);
+  view.ids.resize(count);
+  view.block_sizes.resize(blocks);
+  std::atomic<std::size_t> next{0};
+  pool_.run([&](int) {
+    for (std::size_t block; (block = next.fetch_add(1)) < blocks;)
+      view.block_sizes[block] =
+          kernels_.project(gaussians, view.camera, view.pose, block * kBlock, std::min(count, (block + 1) * kBlock),
+                           view.splats.data(), view.reach.data(), view.ids.data());
+  });
+}
+
+// A stable radix sort, lowest digit first; equal depths keep the order of the map.
+void Engine::sort_by_depth(View& view) {
+  std::vector<std::size_t> begins(view.block_sizes.size() + 1, 0);
+  for (std::size_t block = 0; block < view.block_sizes.size(); ++block)
+    begins[block + 1] = begins[block] + view.block_sizes[block];
+  const std::size_t visible = begins.back();
+  view.order.resize(visible);
+  view.scratch.resize(visible);
+  const int parts = pool_.size();
+  pool_.run([&](int thread) {
+    const std::size_t last = part(view.block_sizes.size(), thread + 1, parts);
+    for (std::size_t block = part(view.block_sizes.size(), thread, parts); block < last; ++block)
+      for (std::size_t i = 0; i < view.block_sizes[block]; ++i) {
+        const std::size_t splat = block * kBlock + i;
+        view.order[begins[block] + i] = std::uint64_t(depth_bits(view.splats[splat].z)) << 32 | splat;
+      }
+  });
+  std::vector<std::array<std::size_t, kDigits>> places(parts);
+  for (int shift = 32; shift < 32 + 3 * kDigitBits; shift += kDigitBits) {
+    const auto digit = [shift](std::uint64_t key) { return key >> shift & (kDigits - 1); };
+    pool_.run([&](int thread) {
+      places[thread].fill(0);
+      const std::size_t last = part(visible, thread + 1, parts);
+      for (std::size_t i = part(visible, thread, parts); i < last; ++i) ++places[thread][digit(view.order[i])];
+    });
+    std::size_t place = 0;
+    for (std::size_t value = 0; value < kDigits; ++value)
+      for (int thread = 0; thread < parts; ++thread) place += std::exchange(places[thread][value], place);
+    pool_.run([&](int thread) {
+      const std::size_t last = part(visible, thread + 1, parts);
+      for (std::size_t i = part(visible, thread, parts); i < last; ++i)
+        view.scratch[places[thread][digit(view.order[i])]++] = view.order[i];
+    });
+    view.order.swap(view.scratch);
+  }
+}
+
+void Engine::list_tiles(View& view) {
+  const std::size_t tiles = std::size_t(view.tiles_x) * view.tiles_y, visible = view.order.size();
+  const int parts = pool_.size();
+  std::vector<std::size_t> places(tiles * parts, 0);  // per thread, per tile: a thread lists its share of the order
+  const auto each_touched = [&](int thread, auto&& visit) {
+    const std::size_t last = part(visible, thread + 1, parts);
+    for (std::size_t i = part(visible, thread, parts); i < last; ++i) {
+      const std::uint32_t splat = std::uint32_t(view.order[i]);
+      visit_tiles(view.splats[splat], view.reach[splat], view, [&](int tile) { visit(tile, splat); });
+    }
+  };
+  pool_.run([&](int thread) {
+    std::size_t* counts = places.data() + tiles * thread;
+    each_touched(thread, [counts](int tile, std::uint32_t) { ++counts[tile]; });
+  });
+  view.tile_begins.resize(tiles + 1);
+  std::size_t place = 0;
+  for (std::size_t tile = 0; tile < tiles; ++tile) {
+    view.tile_begins[tile] = place;
+    for (int thread = 0; thread < parts; ++thread) place += std::exchange(places[tiles * thread + tile], place);
+  }
+  view.tile_begins[tiles] = place;
+  view.entries.resize(place);
+  pool_.run([&](int thread) {
+    std::size_t* next = places.data() + tiles * thread;
+    each_touched(thread, [&, next](int tile, std::uint32_t splat) { view.entries[next[tile]++] = splat; });
+  });
+}
+
+void Engine::blend(const View& view, const Images& images) {
+  const int tiles = view.tiles_x * view.tiles_y;
+  std::atomic<int> next{0};
+  pool_.run([&](int) {
+    for (int tile; (tile = next.fetch_add(1)) < tiles;)
+      kernels_.forward(view.tile(tile), view.splats.data(), view.camera, images);
+  });
+}
+
+namespace {
+
+// Back through one projection: from a splat's gradient to its Gaussian's (where wanted) and to the pose's.
+void project_backward(const View& view, std::size_t splat, const SplatGradient& g, const GaussianArrays& gaussians,
+                      const MapGradients& map, double pose_gradient[12]) {
+  const Splat& s = view.splats[splat];
+  const Camera& camera = view.camera;
+  const std::size_t id = view.ids[splat];
+  const float inverse_z = 1.0f / s.z;
+  const float inverse_variance = -2.0f * s.falloff, variance = 1.0f / inverse_variance;
+  const float du = g.dx * inverse_variance, dv = g.dy * inverse_variance;  // dx is pixel minus centre
+  const float dvariance = 0.5f * g.squared * inverse_variance * inverse_variance;
+  const float spread = 2.0f * (variance - kBlur);  // d variance / d log scale
+  const float x_over_z = (s.u - camera.cx) / camera.fx, y_over_z = (s.v - camera.cy) / camera.fy;
+  const float dx = du * camera.fx * inverse_z, dy = dv * camera.fy * inverse_z;
+  const float dz = g.z - dx * x_over_z - dy * y_over_z - dvariance * spread * inverse_z;
+  const float* mean = gaussians.means + 3 * id;
+  const float d[3] = {dx, dy, dz};
+  for (int row = 0; row < 3; ++row) {
+    for (int column = 0; column < 3; ++column) pose_gradient[4 * row + column] += double(d[row]) * mean[column];
+    pose_gradient[4 * row + 3] += d[row];
+  }
+  if (map.means)
+    for (int axis = 0; axis < 3; ++axis)
+      map.means[3 * id + axis] = view.pose.R[axis] * dx + view.pose.R[3 + axis] * dy + view.pose.R[6 + axis] * dz;
+  if (map.log_scales) map.log_scales[id] = dvariance * spread;
+  if (map.logit_opacities) map.logit_opacities[id] = g.log_alpha * (1.0f - s.opacity);
+  if (map.rgb) {
+    map.rgb[3 * id] = g.r;
+    map.rgb[3 * id + 1] = g.g;
+    map.rgb[3 * id + 2] = g.b;
+  }
+}
+
+// Cuts the tiles into runs of about equal work, always the same ones: sums stay repeatable.
+std::vector<int> balanced_runs(const View& view, int parts) {
+  std::vector<int> begins(parts + 1);
+  for (int index = 0; index <= parts; ++index) {
+    const std::size_t entry = part(view.entries.size(), index, parts);
+    begins[index] = int(std::lower_bound(view.tile_begins.begin(), view.tile_begins.end() - 1, entry) -
+                        view.tile_begins.begin());
+  }
+  begins[0] = 0;
+  begins[parts] = view.tiles_x * view.tiles_y;
+  return begins;
+}
+
+}  // namespace
+
+void Engine::backward(View& view, const GaussianArrays& gaussians, const ConstImages& drawn,
+                      const ConstImages& gradient, const MapGradients& map, float pose_gradient[12]) {
+  std::lock_guard<std::mutex> lock(mutex_);
+  const int parts = pool_.size();
+  const std::size_t count = view.num_gaussians, blocks = view.block_sizes.size();
+  const auto runs = balanced_runs(view, parts);
+  const bool any_map = map.means || map.log_scales || map.logit_opacities || map.rgb;
+  view.gradients.resize(count * parts);
+  pool_.run([&](int thread) {
+    SplatGradient* mine = view.gradients.data() + count * thread;
+    for (std::size_t block = 0; block < blocks; ++block)
+      std::fill_n(mine + block * kBlock, view.block_sizes[block], SplatGradient{});
+    for (int tile = runs[thread]; tile < runs[thread + 1]; ++tile)
+      kernels_.backward(view.tile(tile), view.splats.data(), view.camera, drawn, gradient, any_map, mine);
+  });
+  std::vector<std::array<double, 12>> pose_sums(blocks);
+  std::atomic<std::size_t> next{0};
+  pool_.run([&](int) {
+    for (std::size_t block; (block = next.fetch_add(1)) < blocks;) {
+      pose_sums[block].fill(0.0);
+      for (std::size_t splat = block * kBlock; splat < block * kBlock + view.block_sizes[block]; ++splat) {
+        SplatGradient sum{};
+        for (int thread = 0; thread < parts; ++thread) {
+          const SplatGradient& g = view.gradients[count * thread + splat];
+          sum.log_alpha += g.log_alpha, sum.dx += g.dx, sum.dy += g.dy, sum.squared += g.squared;
+          sum.r += g.r, sum.g += g.g, sum.b += g.b, sum.z += g.z;
+        }
+        project_backward(view, splat, sum, gaussians, map, pose_sums[block].data());
+      }
+    }
+  });
+  for (int entry = 0; entry < 12; ++entry) {
+    double sum = 0.0;
+    for (const auto& block : pose_sums) sum += block[entry];
+    pose_gradient[entry] = float(sum);
+  }
+}
+
+}  // namespace splatam

@@ -1,0 +1,249 @@
+// Included once per instruction set, inside a namespace and a target region. Uses no std templates: an inline
+// function compiled here for a newer processor must never be the one the linker keeps for all.
+
+typedef float Lanes __attribute__((vector_size(32)));
+typedef std::int32_t IntLanes __attribute__((vector_size(32)));
+
+static inline Lanes splat(float value) { return Lanes{} + value; }
+
+static inline Lanes iota() { return Lanes{0, 1, 2, 3, 4, 5, 6, 7}; }
+
+static inline Lanes select(IntLanes mask, Lanes a) { return (Lanes)(mask & (IntLanes)a); }
+
+static inline Lanes choose(IntLanes mask, Lanes a, Lanes b) { return (Lanes)((mask & (IntLanes)a) | (~mask & (IntLanes)b)); }
+
+static inline Lanes min(Lanes a, Lanes b) { return choose(a < b, a, b); }
+
+static inline Lanes max(Lanes a, Lanes b) { return choose(a > b, a, b); }
+
+static inline Lanes load(const float* from) {
+  Lanes value;
+  __builtin_memcpy(&value, from, sizeof value);
+  return value;
+}
+
+static inline void store(float* to, Lanes value) { __builtin_memcpy(to, &value, sizeof value); }
+
+// exp on [-87, 88]: 2^n times a Taylor polynomial of degree 7 on half an octave (relative error below 1e-7).
+static inline Lanes exp(Lanes x) {
+  x = max(min(x, splat(88.0f)), splat(-87.0f));
+  const Lanes shifter = splat(12582912.0f);  // 1.5 * 2^23: adding it rounds to a whole number
+  const Lanes n = (x * 1.44269504f + shifter) - shifter;
+  const Lanes r = (x - n * 0.693359375f) + n * 2.12194440e-4f;  // ln 2 in two parts
+  Lanes p = splat(1.0f / 5040);
+  p = p * r + 1.0f / 720;
+  p = p * r + 1.0f / 120;
+  p = p * r + 1.0f / 24;
+  p = p * r + 1.0f / 6;
+  p = p * r + 0.5f;
+  p = p * r + 1.0f;
+  p = p * r + 1.0f;
+  const IntLanes scale = (__builtin_convertvector(n, IntLanes) + 127) << 23;
+  return p * (Lanes)scale;
+}
+
+// An upper bound of ln x, at most 0.012 above it, for normal x.
+static inline Lanes log_bound(Lanes x) {
+  const IntLanes bits = (IntLanes)x;
+  const Lanes exponent = __builtin_convertvector((bits >> 23) - 127, Lanes);
+  const Lanes m = (Lanes)((bits & 0x007fffff) | 0x3f800000);  // [1, 2)
+  const Lanes log2_m = (m - 1.0f) * (splat(1.68f) - 0.34f * m) + 0.009f;
+  return (exponent + log2_m) * 0.693147181f;
+}
+
+static inline Lanes sqrt(Lanes x) {
+  Lanes root;
+  for (int i = 0; i < 8; ++i) root[i] = __builtin_sqrtf(x[i]);
+  return root;
+}
+
+// Lane i of the result is the sum of the lanes of rows[i].
+static inline Lanes row_sums(const Lanes* rows) {
+  Lanes a[4], b[2];
+  for (int i = 0; i < 4; ++i)
+    a[i] = __builtin_shufflevector(rows[2 * i], rows[2 * i + 1], 0, 8, 2, 10, 4, 12, 6, 14) +
+           __builtin_shufflevector(rows[2 * i], rows[2 * i + 1], 1, 9, 3, 11, 5, 13, 7, 15);
+  for (int i = 0; i < 2; ++i)
+    b[i] = __builtin_shufflevector(a[2 * i], a[2 * i + 1], 0, 1, 8, 9, 4, 5, 12, 13) +
+           __builtin_shufflevector(a[2 * i], a[2 * i + 1], 2, 3, 10, 11, 6, 7, 14, 15);
+  return __builtin_shufflevector(b[0], b[1], 0, 1, 2, 3, 8, 9, 10, 11) +
+         __builtin_shufflevector(b[0], b[1], 4, 5, 6, 7, 12, 13, 14, 15);
+}
+
+static std::size_t project(const GaussianArrays& gaussians, const Camera& camera, const Pose& pose, std::size_t begin,
+                           std::size_t end, Splat* splats, float* reach, std::uint32_t* ids) {
+  std::size_t visible = begin;
+  const float focal = camera.focal();
+  for (std::size_t first = begin; first < end; first += 8) {
+    const int count = end - first < 8 ? int(end - first) : 8;
+    Lanes x{}, y{}, z{}, log_scale{}, logit{};
+    for (int i = 0; i < count; ++i) {
+      const float* mean = gaussians.means + 3 * (first + i);
+      x[i] = mean[0], y[i] = mean[1], z[i] = mean[2];
+      log_scale[i] = gaussians.log_scales[first + i];
+      logit[i] = gaussians.logit_opacities[first + i];
+    }
+    const float *R = pose.R, *t = pose.t;
+    const Lanes cam_x = R[0] * x + R[1] * y + R[2] * z + t[0];
+    const Lanes cam_y = R[3] * x + R[4] * y + R[5] * z + t[1];
+    const Lanes cam_z = R[6] * x + R[7] * y + R[8] * z + t[2];
+    const Lanes inverse_z = 1.0f / cam_z;
+    const Lanes u = camera.fx * cam_x * inverse_z + camera.cx;
+    const Lanes v = camera.fy * cam_y * inverse_z + camera.cy;
+    const Lanes sigma = focal * exp(log_scale) * inverse_z;
+    const Lanes variance = sigma * sigma + kBlur;
+    const Lanes opacity = 1.0f / (1.0f + exp(-logit));
+    const Lanes extent = sqrt(max(2.0f * variance * log_bound(255.0f * opacity), Lanes{}));
+    const IntLanes drawn = (cam_z > kNear) & (opacity >= kMinAlpha) & (u + extent >= 0.0f) &
+                           (u - extent <= float(camera.width - 1)) & (v + extent >= 0.0f) &
+                           (v - extent <= float(camera.height - 1));
+    for (int i = 0; i < count; ++i) {
+      if (!drawn[i]) continue;
+      const float* rgb = gaussians.rgb + 3 * (first + i);
+      splats[visible] = {u[i], v[i], -0.5f / variance[i], opacity[i], rgb[0], rgb[1], rgb[2], cam_z[i]};
+      reach[visible] = extent[i];
+      ids[visible] = std::uint32_t(first + i);
+      ++visible;
+    }
+  }
+  return visible - begin;
+}
+
+// What a splat is to one tile: dx per column, and both separable factors of its alpha.
+struct Footprint {
+  Lanes dx, across;
+  float dy[8], down[8];
+};
+
+static inline Footprint footprint(const Splat& s, const TileList& tile) {
+  Footprint f;
+  f.dx = iota() + (float(tile.x) - s.u);
+  const Lanes dy = iota() + (float(tile.y) - s.v);
+  f.across = exp(f.dx * f.dx * s.falloff);
+  store(f.dy, dy);
+  store(f.down, s.opacity * exp(dy * dy * s.falloff));
+  return f;
+}
+
+// Lanes of a tile's row that lie on the image.
+static inline IntLanes on_image(const TileList& tile, const Camera& camera, int row) {
+  const float columns = tile.y + row < camera.height ? float(camera.width - tile.x) : 0.0f;
+  return iota() < columns;
+}
+
+static inline bool opaque(const Lanes* transmittance) {
+  IntLanes open{};
+  for (int row = 0; row < kTile; ++row) open |= transmittance[row] >= kMinTransmittance;
+  std::int32_t any = 0;
+  for (int i = 0; i < 8; ++i) any |= open[i];
+  return !any;
+}
+
+static inline Lanes load_row(const float* plane, const TileList& tile, const Camera& camera, int row) {
+  float values[8] = {};
+  const int columns = camera.width - tile.x < 8 ? camera.width - tile.x : 8;
+  if (tile.y + row < camera.height)
+    __builtin_memcpy(values, plane + std::size_t(tile.y + row) * camera.width + tile.x, sizeof(float) * columns);
+  return load(values);
+}
+
+static inline void store_row(float* plane, const TileList& tile, const Camera& camera, int row, Lanes value) {
+  if (tile.y + row >= camera.height) return;
+  const int columns = camera.width - tile.x < 8 ? camera.width - tile.x : 8;
+  float values[8];
+  store(values, value);
+  __builtin_memcpy(plane + std::size_t(tile.y + row) * camera.width + tile.x, values, sizeof(float) * columns);
+}
+
+static inline void start_transmittance(Lanes* transmittance, const TileList& tile, const Camera& camera) {
+  for (int row = 0; row < kTile; ++row) transmittance[row] = select(on_image(tile, camera, row), splat(1.0f));
+}
+
+static void forward(const TileList& tile, const Splat* splats, const Camera& camera, const Images& images) {
+  const std::size_t plane = std::size_t(camera.width) * camera.height;
+  Lanes T[kTile], r[kTile] = {}, g[kTile] = {}, b[kTile] = {}, depth[kTile] = {}, silhouette[kTile] = {};
+  start_transmittance(T, tile, camera);
+  for (std::size_t i = 0; i < tile.count; ++i) {
+    if (i % 8 == 7 && opaque(T)) break;
+    const Splat& s = splats[tile.splats[i]];
+    const Footprint f = footprint(s, tile);
+    for (int row = 0; row < kTile; ++row) {
+      if (f.down[row] < kMinAlpha) continue;
+      const Lanes alpha = min(f.down[row] * f.across, splat(kMaxAlpha));
+      const Lanes w = select((alpha >= kMinAlpha) & (T[row] >= kMinTransmittance), alpha * T[row]);
+      r[row] += w * s.r;
+      g[row] += w * s.g;
+      b[row] += w * s.b;
+      depth[row] += w * s.z;
+      silhouette[row] += w;
+      T[row] -= w;
+    }
+  }
+  for (int row = 0; row < kTile; ++row) {
+    store_row(images.rgb, tile, camera, row, r[row]);
+    store_row(images.rgb + plane, tile, camera, row, g[row]);
+    store_row(images.rgb + 2 * plane, tile, camera, row, b[row]);
+    store_row(images.depth, tile, camera, row, depth[row]);
+    store_row(images.silhouette, tile, camera, row, silhouette[row]);
+  }
+}
+
+// Front to back again. With q_k = sum over channels of (gradient times what k adds) and Q what is still to come of
+// sum_k w_k q_k, the whole backward pass is dL/dalpha_k = T_k q_k - Q / (1 - alpha_k).
+template <bool kMap>
+static inline void backward_tile(const TileList& tile, const Splat* splats, const Camera& camera,
+                                 const ConstImages& drawn, const ConstImages& gradient, SplatGradient* gradients) {
+  const std::size_t plane = std::size_t(camera.width) * camera.height;
+  Lanes T[kTile], Q[kTile], gr[kTile], gg[kTile], gb[kTile], gd[kTile], gs[kTile];
+  start_transmittance(T, tile, camera);
+  for (int row = 0; row < kTile; ++row) {
+    gr[row] = load_row(gradient.rgb, tile, camera, row);
+    gg[row] = load_row(gradient.rgb + plane, tile, camera, row);
+    gb[row] = load_row(gradient.rgb + 2 * plane, tile, camera, row);
+    gd[row] = load_row(gradient.depth, tile, camera, row);
+    gs[row] = load_row(gradient.silhouette, tile, camera, row);
+    Q[row] = gr[row] * load_row(drawn.rgb, tile, camera, row) + gg[row] * load_row(drawn.rgb + plane, tile, camera, row) +
+             gb[row] * load_row(drawn.rgb + 2 * plane, tile, camera, row) +
+             gd[row] * load_row(drawn.depth, tile, camera, row) + gs[row] * load_row(drawn.silhouette, tile, camera, row);
+  }
+  for (std::size_t i = 0; i < tile.count; ++i) {
+    if (i % 8 == 7 && opaque(T)) break;
+    const Splat& s = splats[tile.splats[i]];
+    const Footprint f = footprint(s, tile);
+    Lanes sums[8] = {};  // as in SplatGradient
+    Lanes squared_dy{};
+    for (int row = 0; row < kTile; ++row) {
+      if (f.down[row] < kMinAlpha) continue;
+      const Lanes raw = f.down[row] * f.across;
+      const Lanes alpha = min(raw, splat(kMaxAlpha));
+      const IntLanes blended = (alpha >= kMinAlpha) & (T[row] >= kMinTransmittance);
+      const Lanes w = select(blended, alpha * T[row]);
+      const Lanes q = gr[row] * s.r + gg[row] * s.g + gb[row] * s.b + gd[row] * s.z + gs[row];
+      Q[row] -= w * q;
+      const Lanes slope = select(blended & (raw <= kMaxAlpha), alpha * (T[row] * q - Q[row] / (1.0f - alpha)));
+      const Lanes slope_dy = slope * f.dy[row];
+      sums[0] += slope;
+      sums[2] += slope_dy;
+      squared_dy += slope_dy * f.dy[row];
+      if (kMap) {
+        sums[4] += w * gr[row];
+        sums[5] += w * gg[row];
+        sums[6] += w * gb[row];
+      }
+      sums[7] += w * gd[row];
+      T[row] -= w;
+    }
+    sums[1] = sums[0] * f.dx;
+    sums[3] = sums[1] * f.dx + squared_dy;
+    float* into = &gradients[tile.splats[i]].log_alpha;
+    store(into, load(into) + row_sums(sums));
+  }
+}
+
+static void backward(const TileList& tile, const Splat* splats, const Camera& camera, const ConstImages& drawn,
+                     const ConstImages& gradient, bool map, SplatGradient* gradients) {
+  if (map)
+    backward_tile<true>(tile, splats, camera, drawn, gradient, gradients);
+  else
+    backward_tile<false>(tile, splats, camera, drawn, gradient, gradients);
+}

@@ -1,0 +1,27 @@
+#if defined(__x86_64__)
+#include "kernels.hpp"
+
+#if defined(__clang__)
+#pragma clang attribute push(__attribute__((target("avx2,fma"))), apply_to = function)
+#else
+#pragma GCC push_options
+#pragma GCC target("avx2,fma")
+#endif
+namespace splatam {
+namespace avx2 {
+#include "kernels.inl"
+}
+}  // namespace splatam
+#if defined(__clang__)
+#pragma clang attribute pop
+#else
+#pragma GCC pop_options
+#endif
+
+namespace splatam {
+const Kernels& kernels_avx2() {
+  static const Kernels kernels{avx2::project, avx2::forward, avx2::backward, "avx2"};
+  return kernels;
+}
+}  // namespace splatam
+#endif

@@ -1,0 +1,75 @@
+// A few threads that wait for work: run(task) calls task(0..size-1) on all of them and returns when all are done.
+#pragma once
+
+#include <atomic>
+#include <condition_variable>
+#include <functional>
+#include <mutex>
+#include <thread>
+#include <vector>
+
+namespace splatam {
+
+class ThreadPool {
+ public:
+  explicit ThreadPool(int size) : size_(size) {
+    for (int index = 1; index < size; ++index) threads_.emplace_back([this, index] { work(index); });
+  }
+
+  ~ThreadPool() {
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      stopping_ = true;
+      ++generation_;
+    }
+    wake_.notify_all();
+    for (auto& thread : threads_) thread.join();
+  }
+
+  ThreadPool(const ThreadPool&) = delete;
+  ThreadPool& operator=(const ThreadPool&) = delete;
+
+  int size() const { return size_; }
+
+  void run(const std::function<void(int)>& task) {
+    if (size_ == 1) return task(0);
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      task_ = &task;
+      running_.store(size_ - 1, std::memory_order_relaxed);
+      ++generation_;
+    }
+    wake_.notify_all();
+    task(0);
+    // The other threads finish within microseconds of this one, so yielding beats sleeping.
+    while (running_.load(std::memory_order_acquire) != 0) std::this_thread::yield();
+  }
+
+ private:
+  void work(int index) {
+    std::uint64_t seen = 0;
+    for (;;) {
+      const std::function<void(int)>* task;
+      {
+        std::unique_lock<std::mutex> lock(mutex_);
+        wake_.wait(lock, [&] { return generation_ != seen; });
+        seen = generation_;
+        if (stopping_) return;
+        task = task_;
+      }
+      (*task)(index);
+      running_.fetch_sub(1, std::memory_order_release);
+    }
+  }
+
+  const int size_;
+  std::vector<std::thread> threads_;
+  std::mutex mutex_;
+  std::condition_variable wake_;
+  const std::function<void(int)>* task_ = nullptr;
+  std::uint64_t generation_ = 0;
+  std::atomic<int> running_{0};
+  bool stopping_ = false;
+};
+
+}  // namespace splatam

@@ -1,0 +1,57 @@
+"""The contract in plain torch: slow, differentiated by autograd, in any precision. The truth for the others."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from splatam_core.camera import PinholeCamera
+from splatam_core.rasterizer.base import (
+    BLUR_PX2,
+    MAX_ALPHA,
+    MIN_ALPHA,
+    MIN_TRANSMITTANCE,
+    NEAR_M,
+    Gaussians,
+    Render,
+)
+
+_MAX_CELLS = 20_000_000  # Gaussian-pixel pairs held at once
+
+
+class ReferenceRasterizer:
+    """Every Gaussian against every pixel."""
+
+    def render(self, gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -> Render:
+        """See ``Rasterizer.render``."""
+        points = gaussians.means @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]  # [N, 3]
+        drawn = torch.nonzero(points[:, 2].detach() > NEAR_M)[:, 0]
+        drawn = drawn[torch.sort(points[drawn, 2].detach(), stable=True).indices]  # [K] front to back
+        x, y, z = points[drawn].unbind(-1)
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        focal = (camera.fx + camera.fy) / 2
+        variance = (focal * gaussians.log_scales[drawn, 0].exp() / z) ** 2 + BLUR_PX2
+        opacity = torch.sigmoid(gaussians.logit_opacities[drawn])
+        features = torch.cat([gaussians.rgb[drawn], z[:, None], torch.ones_like(z)[:, None]], dim=1)  # [K, 5]
+
+        columns = torch.arange(camera.width, dtype=z.dtype)
+        rows_at_once = max(1, _MAX_CELLS // max(1, len(z) * camera.width))
+        bands = [
+            _blend(u, v, variance, opacity, features, columns, rows.to(z.dtype))
+            for rows in torch.arange(camera.height).split(rows_at_once)
+        ]
+        image = torch.cat(bands, dim=1)  # [5, H, W]
+        return Render(image[:3], image[3], image[4])
+
+
+def _blend(
+    u: Tensor, v: Tensor, variance: Tensor, opacity: Tensor, features: Tensor, columns: Tensor, rows: Tensor
+) -> Tensor:
+    """[5, R, W]: the features of K sorted Gaussians blended over a band of R rows."""
+    squared = (columns - u[:, None, None]) ** 2 + (rows[:, None] - v[:, None, None]) ** 2  # [K, R, W]
+    alpha = opacity[:, None, None] * torch.exp(-squared / (2 * variance[:, None, None]))
+    alpha = torch.where(alpha < MIN_ALPHA, torch.zeros_like(alpha), alpha.clamp(max=MAX_ALPHA))
+    remaining = torch.cumprod(1 - alpha, dim=0)
+    before = torch.cat([torch.ones_like(remaining[:1]), remaining[:-1]])  # transmittance in front of each
+    weights = torch.where(before < MIN_TRANSMITTANCE, torch.zeros_like(alpha), alpha * before)
+    return torch.einsum('krw,kc->crw', weights, features)
