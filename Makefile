@@ -1,0 +1,85 @@
+# `make demo` on a fresh machine sets everything up and takes the whole path once.
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.ONESHELL:
+.DELETE_ON_ERROR:
+
+VENV := .venv
+BIN := $(VENV)/bin
+CSRC := $(wildcard splatam_core/rasterizer/csrc/*)
+FINDABLE = $(foreach name,python3 python3.12 python3.11 python3.10,$(shell $(name) -c '$(CHECK_PYTHON)' 2>/dev/null && echo $(name)))
+CHECK_PYTHON := import sys; sys.exit(0 if (3, 10) <= sys.version_info < (3, 13) else 1)
+PYTHON ?= $(firstword $(FINDABLE))
+export SPLATAM_DATA ?= $(abspath ../shared/data)
+
+.PHONY: help setup test demo colcon check-aarch64 clean
+
+help:
+	@echo 'make setup           make $(VENV) with everything in it (PYTHON=python3.11 chooses the interpreter)'
+	echo 'make test            run the whole test suite'
+	echo 'make demo [BAG=path] play a recording into the node and score what comes out, in out/demo'
+	echo 'make colcon          build and test as a ROS package, in a scratch workspace'
+	echo 'make check-aarch64   compile the kernels for the processors of robots'
+	echo 'make clean           remove what was built; $(VENV) and out stay'
+
+setup: $(VENV)/.installed
+
+$(VENV)/.created:
+	@if [[ -z '$(PYTHON)' ]]; then echo 'splatam_ros needs Python 3.10, 3.11 or 3.12: apt install python3 python3-venv, or PYTHON=path' >&2; exit 1; fi
+	$(PYTHON) -c '$(CHECK_PYTHON)' || { echo "PYTHON=$(PYTHON) is not Python 3.10, 3.11 or 3.12" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV) || { echo '$(PYTHON) cannot make a virtual environment: apt install python3-venv' >&2; exit 1; }
+	touch $@
+
+# The kernels come first: what a machine lacks to compile them should be said before the long download.
+$(VENV)/.native: $(CSRC) setup.py package.xml constraints.txt | $(VENV)/.created
+	@echo 'building the kernels'
+	$(BIN)/python -m pip install --quiet -c constraints.txt setuptools pybind11
+	$(BIN)/python setup.py --quiet build_ext --inplace
+	touch $@
+
+$(VENV)/.installed: setup.py package.xml pyproject.toml constraints.txt $(VENV)/.native
+	@echo 'installing what splatam_ros needs into $(VENV): some minutes the first time'
+	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[ros,test]'
+	touch $@
+
+test: setup
+	@$(BIN)/python -m pytest -q
+
+demo: setup
+	@$(BIN)/python -m splatam_ros.demo $(if $(BAG),--bag '$(BAG)')
+
+# A ROS workspace as colcon sees it, outside the checkout; its virtual environment does not hold splatam_ros.
+colcon: $(VENV)/.created
+	@workspace=$$(mktemp -d)
+	trap 'rm -rf $$workspace' EXIT
+	package=$$workspace/src/splatam_ros
+	mkdir -p $$package
+	git ls-files -z --cached --others --exclude-standard | xargs -0 cp --parents -t $$package
+	$(BIN)/python -m venv $$workspace/venv
+	export PATH=$$workspace/venv/bin:$$PATH AMENT_PREFIX_PATH=$$workspace/venv CMAKE_PREFIX_PATH=$$workspace/venv
+	echo 'installing colcon and what splatam_ros needs: some minutes'
+	pip install --quiet -c constraints.txt "$$package[ros,test]" pybind11
+	pip uninstall --quiet --yes splatam_ros
+	pip install --quiet colcon-common-extensions
+	rm -rf $$package/build $$package/*.egg-info
+	cd $$workspace
+	colcon build
+	colcon test --return-code-on-test-failure
+	colcon test-result --all
+
+# Everything but running it: the shipping flags, a cross compiler, and this machine's Python headers.
+ARM := aarch64-linux-gnu
+check-aarch64: $(VENV)/.native
+	@if ! command -v $(ARM)-g++ >/dev/null; then echo 'skipped: no $(ARM)-g++ (apt install g++-$(ARM))'; exit 0; fi
+	mkdir -p build/aarch64/include
+	ln -sfn /usr/include/x86_64-linux-gnu build/aarch64/include/$(ARM)
+	CC=$(ARM)-gcc CXX=$(ARM)-g++ LDSHARED='$(ARM)-g++ -shared' LDCXXSHARED='$(ARM)-g++ -shared' \
+	CPPFLAGS=-Ibuild/aarch64/include CFLAGS=-fcf-protection=none CXXFLAGS=-fcf-protection=none \
+	_PYTHON_HOST_PLATFORM=linux-aarch64 \
+		$(BIN)/python setup.py --quiet build_ext --force --build-lib build/aarch64 --build-temp build/aarch64
+	$(ARM)-readelf -h $$(find build/aarch64 -name '_native*.so') | grep -E 'Class|Machine'
+
+clean:
+	@rm -rf build dist install log *.egg-info .pytest_cache .hypothesis .ruff_cache
+	rm -f splatam_core/rasterizer/_native*.so $(VENV)/.native
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +

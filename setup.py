@@ -1,0 +1,124 @@
+"""Packaging: two ROS-free libraries, one node package, one native extension; the version is package.xml's."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import sys
+import sysconfig
+from glob import glob
+from pathlib import Path
+from xml.etree import ElementTree
+
+from setuptools import Extension, find_packages, setup
+from setuptools.command.build_ext import build_ext
+
+NAME = 'splatam_ros'
+TOP_LEVEL = (NAME, 'splatam_core', 'msg_adapters')
+CSRC = 'splatam_core/rasterizer/csrc'
+PACKAGE_XML = ElementTree.parse('package.xml').getroot()
+SYSTEM_PYBIND11 = Path('/usr/include/pybind11/pybind11.h')
+
+# No -ffast-math and no -march: NaN must stay NaN, and one build must run on every processor of its kind.
+# No -Wpsabi: it warns that wide vectors cross function calls differently per processor; ours cross none.
+COMPILE_FLAGS = [
+    '-std=c++17', '-O3', '-g0', '-fno-math-errno', '-fno-trapping-math', '-fvisibility=hidden', '-pthread', '-Wno-psabi',
+]  # fmt: skip
+
+
+def pybind11_include_dirs() -> list[str] | None:
+    """Where the pybind11 headers are; None where there are none."""
+    try:
+        import pybind11
+    except ImportError:
+        return [] if SYSTEM_PYBIND11.is_file() else None
+    return [pybind11.get_include()]
+
+
+def missing_for_build() -> str | None:
+    """What has to be installed before the extension can be built, in one line."""
+    compiler = shlex.split(os.environ.get('CXX') or sysconfig.get_config_var('CXX') or 'g++')[0]
+    if sys.version_info < (3, 10):
+        return f'Python {sys.version.split()[0]} is too old: install Python 3.10, 3.11 or 3.12'
+    if shutil.which(compiler) is None:
+        return f"no C++ compiler (looked for '{compiler}'): apt install g++ python3-dev, or set CXX"
+    if not Path(sysconfig.get_path('include'), 'Python.h').is_file():
+        return f'no Python.h in {sysconfig.get_path("include")}: apt install g++ python3-dev'
+    if pybind11_include_dirs() is None:
+        return 'no pybind11 headers: apt install pybind11-dev, or pip install pybind11'
+    return None
+
+
+class BuildNative(build_ext):
+    """Builds the kernels, once everything they need is there."""
+
+    def run(self) -> None:
+        """Build, or leave with one line that says what to install."""
+        if missing := missing_for_build():
+            sys.exit(f'{NAME}: {missing}')
+        super().run()
+
+
+def native_extension() -> Extension:
+    """The C++ kernels of the ``cpu`` rasterizer."""
+    return Extension(
+        'splatam_core.rasterizer._native',
+        sources=sorted(glob(f'{CSRC}/*.cpp')),
+        depends=sorted(glob(f'{CSRC}/*.[hi]*')),
+        include_dirs=pybind11_include_dirs() or [],
+        extra_compile_args=COMPILE_FLAGS,
+        extra_link_args=['-pthread'],
+        language='c++',
+    )
+
+
+def shared_files() -> list[tuple[str, list[str]]]:
+    """What ROS expects below ``share``, and the configuration, folder by folder."""
+    share = f'share/{NAME}'
+    by_folder = {
+        'share/ament_index/resource_index/packages': [f'resource/{NAME}'],
+        share: ['package.xml', 'LICENSE'],
+        f'{share}/launch': glob(f'{NAME}/launch/*.launch.py'),
+        f'{share}/rviz': glob(f'{NAME}/rviz/*.rviz'),
+    }
+    for path in Path('config').rglob('*'):
+        if path.is_file():
+            by_folder.setdefault(f'{share}/{path.parent.as_posix()}', []).append(path.as_posix())
+    return [(folder, sorted(files)) for folder, files in by_folder.items()]
+
+
+setup(
+    name=NAME,
+    version=PACKAGE_XML.findtext('version'),
+    description=PACKAGE_XML.findtext('description'),
+    license=PACKAGE_XML.findtext('license'),
+    maintainer=PACKAGE_XML.findtext('maintainer'),
+    maintainer_email=PACKAGE_XML.find('maintainer').get('email'),
+    packages=find_packages(include=[f'{package}{depth}' for package in TOP_LEVEL for depth in ('', '.*')]),
+    ext_modules=[native_extension()],
+    cmdclass={'build_ext': BuildNative},
+    data_files=shared_files(),
+    python_requires='>=3.10',
+    install_requires=[
+        'matplotlib>=3.5',
+        'numpy>=1.22',
+        'opencv-python-headless>=4.6',
+        'pyyaml>=5.4',
+        'rosbags>=0.10',
+        'torch>=2.2',
+        'tqdm>=4.60',
+    ],
+    extras_require={
+        'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
+        'test': ['pytest>=7', 'hypothesis>=6'],
+    },
+    entry_points={
+        'console_scripts': [
+            'splatam = splatam_core.cli:main',
+            'splatam_node = splatam_ros.main:main',
+            'splatam_bag_player = splatam_ros.bag_player:main',
+        ],
+    },
+    zip_safe=False,
+)

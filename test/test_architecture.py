@@ -1,0 +1,205 @@
+"""Who may import whom (docs: the layers are msg_adapters, splatam_core, splatam_ros), checked import by import."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ('msg_adapters', 'splatam_core', 'splatam_ros')
+
+BAG_READER = 'splatam_core.datasets.rosbag'
+MESSAGES = {
+    'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'rcl_interfaces', 'rosgraph_msgs',
+    'sensor_msgs', 'std_msgs', 'std_srvs', 'tf2_msgs',
+}  # fmt: skip
+MAY_IMPORT = {
+    'msg_adapters': {'cv2', 'msg_adapters', 'numpy'},
+    'splatam_core': {'cv2', 'matplotlib', 'numpy', 'splatam_core', 'torch', 'tqdm', 'yaml'},
+    'splatam_ros': {
+        'ament_index_python', 'launch', 'launch_ros', 'msg_adapters', 'numpy', 'rclpy', 'rosbags', 'splatam_core',
+        'splatam_ros', 'tqdm', *MESSAGES,
+    },
+}  # fmt: skip
+THREADING = {'_thread', 'asyncio', 'concurrent', 'multiprocessing', 'threading'}
+MAY_THREAD = {'splatam_core.worker', 'splatam_ros.bag_player', 'splatam_ros.node'}
+
+
+@dataclass(frozen=True)
+class Import:
+    """One imported name.
+
+    Attributes:
+        name: absolute and dotted; of ``from a import b`` it is ``a.b``.
+        line: where.
+        deferred: whether it waits for a function to be called, or serves type checkers only.
+    """
+
+    name: str
+    line: int
+    deferred: bool
+
+    @property
+    def top(self) -> str:
+        return self.name.partition('.')[0]
+
+
+class ImportFinder(ast.NodeVisitor):
+    """Collects every import of a module, also inside functions and as ``import_module('literal')``."""
+
+    def __init__(self, module: str, is_package: bool) -> None:
+        self.imports: list[Import] = []
+        self._package = module.split('.') if is_package else module.split('.')[:-1]
+        self._depth = 0
+
+    def _add(self, name: str, node: ast.AST) -> None:
+        self.imports.append(Import(name, node.lineno, self._depth > 0))
+
+    def _visit_deferred(self, node: ast.AST) -> None:
+        self._depth += 1
+        self.generic_visit(node)
+        self._depth -= 1
+
+    visit_FunctionDef = visit_AsyncFunctionDef = visit_Lambda = _visit_deferred
+
+    def visit_If(self, node: ast.If) -> None:
+        only_for_types = ast.unparse(node.test).endswith('TYPE_CHECKING')
+        (self._visit_deferred if only_for_types else self.generic_visit)(node)
+
+    def visit_Import(self, node: ast.Import) -> None:
+        for alias in node.names:
+            self._add(alias.name, node)
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
+        above = self._package[: len(self._package) - node.level + 1] if node.level else []
+        module = '.'.join([*above, *([node.module] if node.module else [])])
+        for alias in node.names:
+            self._add(f'{module}.{alias.name}', node)
+
+    def visit_Call(self, node: ast.Call) -> None:
+        called = ast.unparse(node.func).rpartition('.')[2]
+        if called in ('import_module', '__import__') and node.args and isinstance(node.args[0], ast.Constant):
+            self._add(str(node.args[0].value), node)
+        self.generic_visit(node)
+
+
+def breach(module: str, imported: Import) -> str | None:
+    """Why the module may not import this, or None."""
+    package = module.partition('.')[0]
+    if imported.top in THREADING or imported.name.startswith('torch.multiprocessing'):
+        return None if module in MAY_THREAD else 'threads belong into worker.py, the node and the player'
+    if imported.top in sys.stdlib_module_names or imported.top in MAY_IMPORT[package]:
+        return None
+    if package == 'msg_adapters' and imported.top in MESSAGES | {'rosbags'}:
+        return None if imported.deferred else 'message classes are imported only where one is built'
+    if imported.top in ('msg_adapters', 'rosbags') and module == BAG_READER:
+        return None
+    return f'{package} may import only {", ".join(sorted(MAY_IMPORT[package]))} and the standard library'
+
+
+def breaches(module: str, source: str, is_package: bool = False) -> Iterator[str]:
+    """One line for each import of the source that the module may not have."""
+    finder = ImportFinder(module, is_package)
+    finder.visit(ast.parse(source))
+    for imported in finder.imports:
+        if why := breach(module, imported):
+            yield f'{module}:{imported.line} imports {imported.name}: {why}'
+
+
+def source_files() -> list[Path]:
+    """Every Python file of the packages."""
+    return sorted(path for package in PACKAGES for path in (ROOT / package).rglob('*.py'))
+
+
+def module_name(path: Path) -> str:
+    """The dotted name of a file's module."""
+    parts = path.relative_to(ROOT).with_suffix('').parts
+    return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
+
+
+def test_every_import_keeps_to_its_layer() -> None:
+    found = [
+        line
+        for path in source_files()
+        for line in breaches(module_name(path), path.read_text(), path.name == '__init__.py')
+    ]
+    assert not found, '\n' + '\n'.join(found)
+
+
+@pytest.mark.parametrize(
+    ('module', 'source'),
+    [
+        ('splatam_core.slam', 'import rclpy'),
+        ('splatam_core.slam', 'def f():\n    from rclpy.node import Node'),
+        ('splatam_core.slam', 'from sensor_msgs.msg import Image'),
+        ('splatam_core.slam', 'import msg_adapters.images'),
+        ('splatam_core.datasets.tum', 'from msg_adapters import images'),
+        ('splatam_core.datasets.tum', 'import rosbags.rosbag2'),
+        ('splatam_core.datasets.rosbag', 'import rclpy'),
+        ('splatam_core.slam', 'from splatam_ros import node'),
+        ('splatam_core.slam', 'from ..splatam_ros import node'),
+        ('splatam_core.slam', "import importlib\nimportlib.import_module('rclpy')"),
+        ('splatam_core.slam', '__import__("rclpy")'),
+        ('splatam_core.slam', 'import threading'),
+        ('splatam_core.slam', 'from concurrent.futures import ThreadPoolExecutor'),
+        ('splatam_core.slam', 'from torch import multiprocessing'),
+        ('splatam_core.slam', 'try:\n    import rclpy\nexcept ImportError:\n    pass'),
+        ('msg_adapters.images', 'import torch'),
+        ('msg_adapters.images', 'from splatam_core.types import RgbdFrame'),
+        ('msg_adapters.images', 'from sensor_msgs.msg import Image'),
+        ('msg_adapters.synchronizer', 'def f():\n    import rclpy'),
+        ('msg_adapters.synchronizer', 'if TYPE_CHECKING:\n    from splatam_core.types import RgbdFrame'),
+        ('msg_adapters.synchronizer', 'import threading'),
+        ('splatam_ros.outputs', 'import threading'),
+        ('splatam_ros.outputs', 'import cv_bridge'),
+        ('splatam_ros.outputs', 'from tf2_ros import TransformBroadcaster'),
+    ],
+)
+def test_a_breach_is_seen(module: str, source: str) -> None:
+    assert list(breaches(module, source))
+
+
+@pytest.mark.parametrize(
+    ('module', 'source'),
+    [
+        ('splatam_core.datasets.rosbag', 'from msg_adapters import images\nfrom rosbags.rosbag2 import Reader'),
+        ('splatam_core.slam', 'from . import se3\nfrom .rasterizer.base import Render'),
+        ('splatam_core.worker', 'import threading'),
+        ('msg_adapters.factory', 'def f():\n    from sensor_msgs.msg import Image'),
+        ('splatam_ros.node', 'import rclpy, threading\nfrom splatam_core.worker import SlamWorker'),
+    ],
+)
+def test_what_is_allowed_stays_allowed(module: str, source: str) -> None:
+    assert not list(breaches(module, source))
+
+
+IMPORT_ALL = """
+import importlib, pkgutil, sys
+package = importlib.import_module(sys.argv[1])
+for module in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):
+    importlib.import_module(module.name)
+loaded = {name.partition('.')[0] for name in sys.modules}
+print(*sorted(loaded & set(sys.argv[2:])))
+"""
+
+
+@pytest.mark.parametrize(
+    ('package', 'never'),
+    [
+        ('msg_adapters', {'rclpy', 'rosbags', 'splatam_core', 'splatam_ros', 'torch', *MESSAGES}),
+        ('splatam_core', {'rclpy', 'splatam_ros', *MESSAGES}),
+    ],
+)
+def test_importing_everything_loads_nothing_from_above(package: str, never: set[str]) -> None:
+    """The same rule at run time: what a library imports, and what that imports in turn."""
+    loaded = subprocess.run(
+        [sys.executable, '-c', IMPORT_ALL, package, *never], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert loaded.returncode == 0, loaded.stderr
+    assert loaded.stdout.split() == []
