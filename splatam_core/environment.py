@@ -1,0 +1,82 @@
+"""What a run ran on: the facts that make its numbers comparable."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import cv2
+import numpy
+import torch
+
+DISTRIBUTION = 'splatam_ros'
+
+
+def package_version() -> str | None:
+    """The installed version; None where the code runs without having been installed."""
+    try:
+        return version(DISTRIBUTION)
+    except PackageNotFoundError:
+        return None
+
+
+def commit() -> str | None:
+    """The commit this code is of, with ``-dirty`` when it was changed since; None outside its repository.
+
+    A virtual environment inside some repository is not of that repository: this very file must be tracked in it.
+    """
+    if _git('ls-files', '--error-unmatch', Path(__file__).name) is None:
+        return None
+    head = _git('rev-parse', 'HEAD')
+    return None if head is None else head + ('-dirty' if _git('status', '--porcelain', '-uno', ':/') else '')
+
+
+def _git(*arguments: str) -> str | None:
+    command = ['git', '-C', str(Path(__file__).parent), *arguments]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def machine() -> dict[str, str | int]:
+    """Processor, usable cores, memory and system."""
+    return {
+        'system': platform.platform(),
+        'processor': _processor(),
+        'cores': len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1,
+        'memory_mb': os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') // 2**20,
+    }
+
+
+def _processor() -> str:
+    fields = _fields(Path('/proc/cpuinfo'))
+    return fields.get('model name') or platform.processor() or platform.machine()
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of this package and of what its numbers depend on."""
+    return {
+        DISTRIBUTION: package_version(),
+        'python': platform.python_version(),
+        'torch': torch.__version__,
+        'numpy': numpy.__version__,
+        'opencv': cv2.__version__,
+    }
+
+
+def peak_rss_mb() -> float | None:
+    """Most memory this process held at once, MiB; None where the system does not say."""
+    peak = _fields(Path('/proc/self/status')).get('VmHWM')  # unlike ru_maxrss not inherited from the parent
+    return None if peak is None else round(int(peak.split()[0]) / 1024, 1)
+
+
+def _fields(path: Path) -> dict[str, str]:
+    """The ``name: value`` lines of a file in /proc; nothing where there is no such file."""
+    if not path.exists():
+        return {}
+    pairs = (line.partition(':') for line in path.read_text().splitlines())
+    return {name.strip(): value.strip() for name, _, value in pairs}

@@ -1,0 +1,157 @@
+"""Maps as files: the PLY layout that 3D Gaussian splatting viewers read.
+
+One ``vertex`` element of little-endian floats per Gaussian: centre, unused normals, colour as the zeroth
+spherical-harmonics coefficient ``f_dc = (rgb - 0.5) / C0``, logit opacity, three log scales in metres and a
+quaternion w x y z. An isotropic Gaussian repeats its scale and does not rotate.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatam_core.errors import MapFileError
+from splatam_core.files import replaced
+from splatam_core.rasterizer.base import Gaussians
+
+SH_C0 = 0.28209479177387814
+"""Value of the zeroth spherical harmonic, 1 / (2 sqrt(pi))."""
+
+NORMALS = ('nx', 'ny', 'nz')
+SCALES = ('scale_0', 'scale_1', 'scale_2')
+ROTATION = ('rot_0', 'rot_1', 'rot_2', 'rot_3')
+NEEDED = ('x', 'y', 'z', 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', *SCALES)
+PROPERTIES = ('x', 'y', 'z', *NORMALS, 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', *SCALES, *ROTATION)
+
+COMMENTS = (
+    'Gaussian map of splatam_ros',
+    'world = first camera, optical axes: x right, y down, z forward; metres',
+    'a pixel\'s centre is its integer index: u = fx x/z + cx',
+)
+
+_SCALAR_TYPES = {
+    'char': 'i1', 'int8': 'i1', 'uchar': 'u1', 'uint8': 'u1', 'short': 'i2', 'int16': 'i2', 'ushort': 'u2',
+    'uint16': 'u2', 'int': 'i4', 'int32': 'i4', 'uint': 'u4', 'uint32': 'u4', 'float': 'f4', 'float32': 'f4',
+    'double': 'f8', 'float64': 'f8',
+}  # fmt: skip
+_MAX_HEADER_BYTES = 65536
+
+
+def write_ply(path: Path, gaussians: Gaussians) -> None:
+    """Write a map; a file that is there is replaced once the new one is complete."""
+    columns = _columns(gaussians)
+    rows = np.zeros(len(gaussians), dtype=[(name, '<f4') for name in PROPERTIES])
+    for name, column in columns.items():
+        rows[name] = column
+    header = [
+        'ply', 'format binary_little_endian 1.0', *(f'comment {line}' for line in COMMENTS),
+        f'element vertex {len(rows)}', *(f'property float {name}' for name in PROPERTIES), 'end_header', '',
+    ]  # fmt: skip
+    with replaced(path) as temporary, temporary.open('wb') as file:
+        file.write('\n'.join(header).encode('ascii'))
+        file.write(rows.tobytes())
+
+
+def _columns(gaussians: Gaussians) -> dict[str, NDArray[np.float64]]:
+    g = gaussians.detached()
+    means, rgb, logits, log_scales = (
+        tensor.cpu().numpy().astype(np.float64) for tensor in (g.means, g.rgb, g.logit_opacities, g.log_scales)
+    )
+    columns = dict(zip('xyz', means.T))
+    columns |= {f'f_dc_{c}': (rgb[:, c] - 0.5) / SH_C0 for c in range(3)}
+    columns |= {'opacity': logits, 'rot_0': np.ones(len(means))}
+    return columns | {name: log_scales[:, 0] for name in SCALES}
+
+
+def read_ply(path: Path) -> Gaussians:
+    """Read a map of isotropic Gaussians.
+
+    Higher spherical-harmonics coefficients (colour that depends on the direction) are left out.
+
+    Returns:
+        float32 tensors, ``log_scales`` of shape [N, 1].
+
+    Raises:
+        MapFileError: the file cannot be read, is no such PLY, is cut short, or holds a number that is not finite
+            or Gaussians that are not isotropic.
+    """
+    try:
+        with path.open('rb') as file:
+            header = _read_header(file)
+            rows = _read_rows(file, header)
+    except OSError as error:
+        raise MapFileError(f'{path}: cannot be read: {error.strerror}') from None
+    except ValueError as error:
+        raise MapFileError(f'{path}: {error}') from None
+    values = {name: rows[name].astype(np.float32) for name in NEEDED}
+    _check_values(path, values)
+    return Gaussians(
+        means=_tensor(values, ('x', 'y', 'z')),
+        log_scales=_tensor(values, SCALES[:1]),
+        logit_opacities=torch.from_numpy(values['opacity']),
+        rgb=_tensor(values, ('f_dc_0', 'f_dc_1', 'f_dc_2')) * SH_C0 + 0.5,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Header:
+    count: int
+    row: np.dtype
+
+
+def _read_header(file: BinaryIO) -> _Header:
+    if file.readline(_MAX_HEADER_BYTES).rstrip() != b'ply':
+        raise ValueError("not a PLY file: it does not start with 'ply'")
+    lines = []
+    while (line := file.readline(_MAX_HEADER_BYTES)).rstrip() != b'end_header':
+        if not line.endswith(b'\n') or file.tell() > _MAX_HEADER_BYTES:
+            raise ValueError("the header has no 'end_header': the file is damaged or no PLY")
+        lines.append(line.decode('ascii', errors='replace').split())
+    return _parse_header([words for words in lines if words and words[0] not in ('comment', 'obj_info')])
+
+
+def _parse_header(lines: list[list[str]]) -> _Header:
+    if lines[:1] != [['format', 'binary_little_endian', '1.0']]:
+        raise ValueError(f"format is '{' '.join(lines[0][1:]) if lines else ''}'; only binary_little_endian 1.0 is read")
+    if len(lines) < 2 or lines[1][:2] != ['element', 'vertex'] or len(lines[1]) != 3:
+        raise ValueError("the first element must be 'vertex', one per Gaussian")
+    if not lines[1][2].isdecimal():
+        raise ValueError(f"'{lines[1][2]}' is not a number of vertices")
+    properties = []
+    for words in lines[2:]:
+        if words[0] == 'element':  # faces and the like: they lie behind the vertices and do not matter
+            break
+        if len(words) != 3 or words[0] != 'property' or words[1] not in _SCALAR_TYPES:
+            raise ValueError(f"header line '{' '.join(words)}' is no scalar property of a vertex")
+        properties.append((words[2], '<' + _SCALAR_TYPES[words[1]]))
+    names = [name for name, _ in properties]
+    if missing := [name for name in NEEDED if name not in names]:
+        raise ValueError(f'no property {", ".join(missing)}: not a map in the 3D Gaussian splatting layout')
+    return _Header(int(lines[1][2]), np.dtype(properties))  # a name given twice is a ValueError here
+
+
+def _read_rows(file: BinaryIO, header: _Header) -> NDArray[np.void]:
+    available = os.fstat(file.fileno()).st_size - file.tell()
+    needed = header.count * header.row.itemsize
+    if available < needed:
+        raise ValueError(f'{header.count} Gaussians take {needed} bytes, {available} are there: the file is cut short')
+    return np.fromfile(file, dtype=header.row, count=header.count)
+
+
+def _check_values(path: Path, values: dict[str, NDArray[np.float32]]) -> None:
+    finite = np.all([np.isfinite(column) for column in values.values()], axis=0)
+    if not finite.all():
+        raise MapFileError(f'{path}: {int((~finite).sum())} of {len(finite)} Gaussians hold NaN or infinity')
+    first, *others = (values[name] for name in SCALES)
+    if any((first != other).any() for other in others):
+        raise MapFileError(f'{path}: the Gaussians are not isotropic (scale_0, scale_1, scale_2 differ); only such are read')
+
+
+def _tensor(values: dict[str, NDArray[np.float32]], names: tuple[str, ...]) -> torch.Tensor:
+    return torch.from_numpy(np.stack([values[name] for name in names], axis=1))

@@ -1,0 +1,399 @@
+"""A run's folder: what ``splatam run`` and the node leave behind, and ``splatam evaluate`` reads.
+
+::
+
+    trajectory.txt   one line a frame, written at once: 'stamp tx ty tz qx qy qz qw', or '# lost stamp'
+    frames.csv       one line a frame: status, shares, times
+    map.ply          the Gaussians
+    metrics.json     the numbers; null until evaluated
+    config.yaml      every setting
+    run.json         source, camera, commit, machine, versions
+    report.png       drawn by the evaluation
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from datetime import datetime, timezone
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, TextIO
+
+from splatam_core import environment
+from splatam_core.camera import PinholeCamera
+from splatam_core.config import SlamConfig, load_config, to_yaml
+from splatam_core.errors import RunFolderError, SplatamError
+from splatam_core.evaluation.metrics import STAGES, Metrics, stage_statistics
+from splatam_core.files import replace_text
+from splatam_core.ply import write_ply
+from splatam_core.trajectory import pose_line, read_trajectory, stamp_from_text, stamp_text
+from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status, Trajectory
+
+if TYPE_CHECKING:
+    from splatam_core.slam import Slam
+
+TRAJECTORY = 'trajectory.txt'
+FRAMES = 'frames.csv'
+MAP = 'map.ply'
+METRICS = 'metrics.json'
+CONFIG = 'config.yaml'
+RUN = 'run.json'
+REPORT = 'report.png'
+FILES = (TRAJECTORY, FRAMES, MAP, METRICS, CONFIG, RUN, REPORT)
+CHECKPOINTS = 'checkpoints'
+LOST = '# lost '
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A recording and how it was read: the arguments of ``open_sequence``.
+
+    Attributes:
+        path: dataset folder, bag, or ``synthetic:...``; absolute where it is a path.
+        format: name of the reader; None = guessed.
+        start: frames left out at the beginning.
+        max_frames: frames read at most; None = all.
+        width: of the frames in pixels; None = as recorded.
+        rgb: colour topic of a bag; None = found by type.
+        depth: depth topic.
+        info: camera info topic.
+    """
+
+    path: str
+    format: str | None = None
+    start: int = 0
+    max_frames: int | None = None
+    width: int | None = None
+    rgb: str | None = None
+    depth: str | None = None
+    info: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RunDescription:
+    """What a run is of.
+
+    Attributes:
+        program: who ran it, ``splatam run`` or ``splatam_node``.
+        preset: the preset it started from; None = the defaults.
+        source: where its frames came from; None = live topics.
+    """
+
+    program: str
+    preset: str | None = None
+    source: Source | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRecord:
+    """One frame of a run, as in ``frames.csv``.
+
+    Attributes:
+        stamp_ns: the frame's stamp.
+        status: what became of it.
+        is_keyframe: whether it was kept for mapping.
+        num_gaussians: size of the map after it.
+        sure_fraction: see ``FrameResult``.
+        inlier_fraction: see ``FrameResult``.
+        process_ms: wall time in SLAM.
+        decode_ms: wall time reading and decoding it; None where that went on beside SLAM.
+        timings: wall time of each stage.
+        reason: why it is lost; empty otherwise.
+    """
+
+    stamp_ns: int
+    status: Status
+    is_keyframe: bool
+    num_gaussians: int
+    sure_fraction: float
+    inlier_fraction: float
+    process_ms: float
+    decode_ms: float | None
+    timings: StageTimings
+    reason: str
+
+
+class RunFolder:
+    """Writes a run's folder while it runs. Every frame's line is on disk before the next frame begins.
+
+    Use as a context manager, or call ``close``. Not for several threads at once.
+    """
+
+    def __init__(self, path: Path, trajectory: TextIO, frames: TextIO) -> None:
+        self.path = path
+        self._trajectory = trajectory
+        self._frames = frames
+        self._records: list[FrameRecord] = []
+
+    @classmethod
+    def create(
+        cls, path: Path, config: SlamConfig, description: RunDescription, *, overwrite: bool = False
+    ) -> RunFolder:
+        """Make the folder, with ``config.yaml`` and ``run.json`` in it.
+
+        Args:
+            path: the folder; may exist when it is empty.
+            config: the run's configuration.
+            description: what it is of.
+            overwrite: remove the run that is there, if a run and nothing else is there.
+
+        Raises:
+            RunFolderError: something is there already, or it cannot be written.
+        """
+        try:
+            if path.is_dir() and any(path.iterdir()) and overwrite:
+                _remove_run(path)
+            elif path.exists() and not (path.is_dir() and not any(path.iterdir())):
+                raise RunFolderError(f'{path} exists: choose another folder{_overwrite_hint(path)}')
+            path.mkdir(parents=True, exist_ok=True)
+            (path / CONFIG).write_text(to_yaml(config))
+            replace_text(path / RUN, _to_json(_run_information(description)))
+            trajectory, frames = ((path / name).open('x', newline='\n') for name in (TRAJECTORY, FRAMES))
+        except OSError as error:
+            raise RunFolderError(f'{path}: cannot be written: {error.strerror}; choose another folder') from None
+        _write_csv_row(frames, _CSV_HEADER)
+        return cls(path, trajectory, frames)
+
+    def append(self, frame: RgbdFrame, result: FrameResult, process_s: float, decode_s: float | None = None) -> None:
+        """Write down one frame.
+
+        Args:
+            frame: what went in.
+            result: what came of it.
+            process_s: wall time in ``Slam.process``.
+            decode_s: wall time reading and decoding; None where that went on beside SLAM.
+        """
+        if not self._records:
+            self._write_camera(frame.camera)
+        self._trajectory.write(_trajectory_line(result) + '\n')
+        self._trajectory.flush()
+        record = _record(result, process_s, decode_s)
+        _write_csv_row(self._frames, _csv_row(record))
+        self._records.append(record)
+
+    def save(self, slam: Slam) -> Metrics:
+        """Write ``map.ply`` and ``metrics.json`` as of now; may be called again later."""
+        gaussians = slam.gaussians()
+        write_ply(self.path / MAP, gaussians)
+        metrics = run_metrics(self._records, len(gaussians), environment.peak_rss_mb())
+        replace_text(self.path / METRICS, metrics.to_json())
+        return metrics
+
+    def finish(self, slam: Slam) -> Metrics:
+        """Save, and close the files."""
+        metrics = self.save(slam)
+        self.close()
+        return metrics
+
+    def close(self) -> None:
+        """Close the files; once closed nothing can be appended."""
+        self._trajectory.close()
+        self._frames.close()
+
+    def __enter__(self) -> RunFolder:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _write_camera(self, camera: PinholeCamera) -> None:
+        information = json.loads((self.path / RUN).read_text())
+        replace_text(self.path / RUN, _to_json(information | {'camera': asdict(camera)}))
+
+
+def run_metrics(records: Sequence[FrameRecord], num_gaussians: int | None, peak_rss_mb: float | None) -> Metrics:
+    """What a run's frames say about it without any truth."""
+    lost = sum(record.status is Status.LOST for record in records)
+    process_ms = sum(record.process_ms for record in records)
+    decode_ms = [record.decode_ms for record in records if record.decode_ms is not None]
+    with_io_ms = process_ms + sum(decode_ms) if len(decode_ms) == len(records) else 0.0
+    return Metrics(
+        frames=len(records),
+        tracked=len(records) - lost,
+        lost=lost,
+        fps=_rate(len(records), process_ms),
+        fps_with_io=_rate(len(records), with_io_ms),
+        num_gaussians=num_gaussians,
+        peak_rss_mb=peak_rss_mb,
+        timings_ms=stage_statistics([record.timings for record in records]),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class RunRecord:
+    """A run read back from its folder.
+
+    Attributes:
+        path: the folder.
+        config: every setting.
+        description: what it is of.
+        camera: of its frames; None when there was no frame.
+        commit: of the code; None where unknown.
+        trajectory: the tracked frames.
+        lost_ns: stamps of the lost ones.
+        frames: one record a frame; empty where there is no ``frames.csv``.
+    """
+
+    path: Path
+    config: SlamConfig
+    description: RunDescription
+    camera: PinholeCamera | None
+    commit: str | None
+    trajectory: Trajectory
+    lost_ns: tuple[int, ...]
+    frames: tuple[FrameRecord, ...]
+
+    def metrics(self) -> Metrics:
+        """The numbers the run wrote, or, when it was killed before it could, what its frames say.
+
+        Raises:
+            RunFolderError: ``metrics.json`` is damaged.
+        """
+        path = self.path / METRICS
+        if not path.exists():
+            return run_metrics(self.frames, None, None)
+        try:
+            return Metrics.from_json(path.read_text())
+        except RunFolderError as error:
+            raise RunFolderError(f'{self.path}: {error}') from None
+
+
+def read_run(path: Path) -> RunRecord:
+    """Read a run's folder.
+
+    Raises:
+        RunFolderError: it is no run folder, or one of its files is damaged.
+    """
+    if missing := [name for name in (TRAJECTORY, CONFIG, RUN) if not (path / name).is_file()]:
+        raise RunFolderError(f'{path} is no run folder: it has no {", ".join(missing)}')
+    try:
+        information = json.loads((path / RUN).read_text())
+        source, camera = information['source'], information['camera']
+        description = RunDescription(
+            information['program'], information['preset'], None if source is None else Source(**source)
+        )
+        return RunRecord(
+            path=path,
+            config=load_config(str(path / CONFIG)),
+            description=description,
+            camera=None if camera is None else PinholeCamera(**camera),
+            commit=information['commit'],
+            trajectory=read_trajectory(path / TRAJECTORY),
+            lost_ns=_read_lost(path / TRAJECTORY),
+            frames=_read_frames(path / FRAMES),
+        )
+    except SplatamError as error:
+        raise RunFolderError(f'{path} cannot be read: {error}') from None
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise RunFolderError(f'{path} cannot be read: {error!r}; was it written by another version?') from None
+
+
+def _overwrite_hint(path: Path) -> str:
+    return ', or pass --overwrite to replace the run in it' if (path / RUN).is_file() else ''
+
+
+def _remove_run(path: Path) -> None:
+    """Remove a run's files, and nothing that no run wrote."""
+    if not (path / RUN).is_file():
+        raise RunFolderError(f'{path} holds no run ({RUN} is missing), so it is not overwritten: choose another folder')
+    others = sorted(entry.name for entry in path.iterdir() if entry.name not in (*FILES, CHECKPOINTS))
+    if others:
+        raise RunFolderError(
+            f'{path} holds more than a run ({", ".join(others[:5])}), so it is not overwritten: '
+            'move that away or choose another folder'
+        )
+    shutil.rmtree(path)
+
+
+def _run_information(description: RunDescription) -> dict[str, Any]:
+    return {
+        **asdict(description),
+        'camera': None,
+        'started': datetime.now(timezone.utc).isoformat(timespec='seconds'),
+        'commit': environment.commit(),
+        'machine': environment.machine(),
+        'versions': environment.versions(),
+    }
+
+
+def _to_json(values: dict[str, Any]) -> str:
+    return json.dumps(values, indent=2) + '\n'
+
+
+def _trajectory_line(result: FrameResult) -> str:
+    if result.T_world_cam is None:
+        return LOST + stamp_text(result.stamp_ns)
+    return pose_line(result.stamp_ns, result.T_world_cam)
+
+
+def _record(result: FrameResult, process_s: float, decode_s: float | None) -> FrameRecord:
+    return FrameRecord(
+        stamp_ns=result.stamp_ns,
+        status=result.status,
+        is_keyframe=result.is_keyframe,
+        num_gaussians=result.num_gaussians,
+        sure_fraction=result.sure_fraction,
+        inlier_fraction=result.inlier_fraction,
+        process_ms=process_s * 1e3,
+        decode_ms=None if decode_s is None else decode_s * 1e3,
+        timings=result.timings,
+        reason=result.reason,
+    )
+
+
+def _rate(frames: int, wall_ms: float) -> float | None:
+    return round(frames / wall_ms * 1e3, 3) if wall_ms > 0 else None
+
+
+_CSV_HEADER = [
+    'stamp', 'status', 'is_keyframe', 'num_gaussians', 'sure_fraction', 'inlier_fraction', 'process_ms', 'decode_ms',
+    *(f'{stage}_ms' for stage in STAGES), 'reason',
+]  # fmt: skip
+
+
+def _csv_row(record: FrameRecord) -> list[str]:
+    times_ms = [getattr(record.timings, stage) for stage in STAGES]
+    return [
+        stamp_text(record.stamp_ns), record.status.value, str(int(record.is_keyframe)), str(record.num_gaussians),
+        f'{record.sure_fraction:.4f}', f'{record.inlier_fraction:.4f}', f'{record.process_ms:.3f}',
+        '' if record.decode_ms is None else f'{record.decode_ms:.3f}', *(f'{time_ms:.3f}' for time_ms in times_ms),
+        record.reason,
+    ]  # fmt: skip
+
+
+def _write_csv_row(file: TextIO, row: list[str]) -> None:
+    csv.writer(file, lineterminator='\n').writerow(row)
+    file.flush()
+
+
+def _read_lost(path: Path) -> tuple[int, ...]:
+    lines = path.read_text().splitlines()
+    return tuple(stamp_from_text(line.removeprefix(LOST)) for line in lines if line.startswith(LOST))
+
+
+def _read_frames(path: Path) -> tuple[FrameRecord, ...]:
+    if not path.exists():
+        return ()
+    with path.open(newline='') as file:
+        return tuple(_frame_record(row) for row in csv.DictReader(file))
+
+
+def _frame_record(row: dict[str, str]) -> FrameRecord:
+    return FrameRecord(
+        stamp_ns=stamp_from_text(row['stamp']),
+        status=Status(row['status']),
+        is_keyframe=row['is_keyframe'] == '1',
+        num_gaussians=int(row['num_gaussians']),
+        sure_fraction=float(row['sure_fraction']),
+        inlier_fraction=float(row['inlier_fraction']),
+        process_ms=float(row['process_ms']),
+        decode_ms=float(row['decode_ms']) if row['decode_ms'] else None,
+        timings=StageTimings(*(float(row[f'{stage}_ms']) for stage in STAGES)),
+        reason=row['reason'],
+    )
