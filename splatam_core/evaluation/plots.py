@@ -78,7 +78,7 @@ def coordinates_over_time(axes: NDArray[np.object_], evaluation: Evaluation) -> 
         ax.yaxis.set_major_locator(MaxNLocator(4))
         ax.tick_params(labelbottom=axis == 2)
     axes[0].set_title('Path over time')
-    axes[0].legend(loc='best', ncols=3)
+    axes[0].legend(loc='best', ncol=3)
     axes[-1].set_xlabel('time (s)')
 
 
@@ -134,7 +134,7 @@ def stage_times(ax: Axes, evaluation: Evaluation) -> None:
     ax.set_ylim(0, max(1e-3, float(np.percentile(times_ms.sum(axis=0), 99)) * 1.35))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     handles, labels = ax.get_legend_handles_labels()
-    ax.legend(handles[::-1], labels[::-1], loc='upper left', ncols=2, title='median', title_fontsize=8)
+    ax.legend(handles[::-1], labels[::-1], loc='upper left', ncol=2, title='median', title_fontsize=8)
 
 
 def map_size(ax: Axes, evaluation: Evaluation) -> None:
