@@ -7,6 +7,7 @@ table all derive from the dataclasses below.
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
@@ -301,3 +302,10 @@ def _unknown(name: str, known: Mapping[str, Setting]) -> str:
         close = same_leaf[:1]
     hint = f"; did you mean '{close[0]}'?" if close else f'; known: {", ".join(known)}'
     return f"unknown key '{name}'{hint}"
+
+
+def apply_threads(config: SlamConfig) -> None:
+    """Give torch as many threads as the configuration says. For whoever owns the process, once."""
+    import torch
+
+    torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))

@@ -25,18 +25,12 @@ std::uint32_t depth_bits(float z) {
   return bits - near;
 }
 
-// Calls visit(tile) for each tile that a splat's disc touches.
+// Calls visit(tile) for each tile that a splat touches.
 template <typename Visit>
-void visit_tiles(const Splat& s, float reach, const View& view, Visit&& visit) {
-  const float last_y = float(view.camera.height - 1), last_x = float(view.camera.width - 1);
-  const int y0 = int(std::max(0.0f, s.v - reach)) / kTile, y1 = int(std::min(last_y, s.v + reach)) / kTile;
-  for (int y = y0; y <= y1; ++y) {
-    const float top = float(y * kTile), bottom = top + (kTile - 1);
-    const float dy = std::max({0.0f, top - s.v, s.v - bottom});
-    const float half = std::sqrt(std::max(0.0f, reach * reach - dy * dy));
-    const float left = std::max(0.0f, std::ceil(s.u - half)), right = std::min(last_x, std::floor(s.u + half));
-    if (left > right) continue;
-    for (int x = int(left) / kTile; x <= int(right) / kTile; ++x) visit(y * view.tiles_x + x);
+void visit_tiles(const TileRect& rect, int tiles_x, Visit&& visit) {
+  for (int y = rect.y0; y <= rect.y1; ++y) {
+    const int missed = (y == rect.y0 ? rect.missed_corners & 3 : 0) | (y == rect.y1 ? rect.missed_corners >> 2 : 0);
+    for (int x = rect.x0 + (missed & 1); x <= rect.x1 - (missed >> 1); ++x) visit(y * tiles_x + x);
   }
 }
 
@@ -83,7 +77,7 @@ std::shared_ptr<View> Engine::forward(const GaussianArrays& gaussians, std::size
 void Engine::project(View& view, const GaussianArrays& gaussians) {
   const std::size_t count = view.num_gaussians, blocks = blocks_of(count);
   view.splats.resize(count);
-  view.reach.resize(count);
+  view.rects.resize(count);
   view.ids.resize(count);
   view.block_sizes.resize(blocks);
   std::atomic<std::size_t> next{0};
@@ -91,7 +85,7 @@ void Engine::project(View& view, const GaussianArrays& gaussians) {
     for (std::size_t block; (block = next.fetch_add(1)) < blocks;)
       view.block_sizes[block] =
           kernels_.project(gaussians, view.camera, view.pose, block * kBlock, std::min(count, (block + 1) * kBlock),
-                           view.splats.data(), view.reach.data(), view.ids.data());
+                           view.splats.data(), view.rects.data(), view.ids.data());
   });
 }
 
@@ -140,7 +134,7 @@ void Engine::list_tiles(View& view) {
     const std::size_t last = part(visible, thread + 1, parts);
     for (std::size_t i = part(visible, thread, parts); i < last; ++i) {
       const std::uint32_t splat = std::uint32_t(view.order[i]);
-      visit_tiles(view.splats[splat], view.reach[splat], view, [&](int tile) { visit(tile, splat); });
+      visit_tiles(view.rects[splat], view.tiles_x, [&](int tile) { visit(tile, splat); });
     }
   };
   pool_.run([&](int thread) {

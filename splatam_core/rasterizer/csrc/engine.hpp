@@ -16,7 +16,7 @@ struct View {
   Pose pose;
   std::size_t num_gaussians = 0;
   std::vector<Splat> splats;
-  std::vector<float> reach;              // px
+  std::vector<TileRect> rects;
   std::vector<std::uint32_t> ids;        // splat -> Gaussian
   std::vector<std::size_t> block_sizes;  // visible Gaussians per block
   std::vector<std::uint64_t> order, scratch;  // depth bits << 32 | splat

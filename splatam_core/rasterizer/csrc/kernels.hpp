@@ -28,6 +28,13 @@ struct Splat {
   float u, v, falloff, opacity, r, g, b, z;
 };
 
+// The tiles that a splat's disc touches: columns x0..x1, rows y0..y1, less the corners (top left, top right, bottom
+// left, bottom right: bits 0 to 3) that the disc misses.
+struct TileRect {
+  std::uint16_t x0, y0, x1, y1 : 12, missed_corners : 4;
+};
+constexpr int kMaxTiles = 1 << 12;  // per side
+
 // Sums over pixels of dL/d(log alpha) times 1, dx, dy, d^2, and of dL/d(r, g, b, z).
 struct SplatGradient {
   float log_alpha, dx, dy, squared, r, g, b, z;
@@ -52,10 +59,10 @@ struct TileList {
 };
 
 struct Kernels {
-  // Projects Gaussians [begin, end); writes the visible ones to splats, reach (px) and ids, from `begin` on.
+  // Projects Gaussians [begin, end); writes the visible ones to splats, rects and ids, from `begin` on.
   // Returns how many are visible.
   std::size_t (*project)(const GaussianArrays&, const Camera&, const Pose&, std::size_t begin, std::size_t end,
-                         Splat* splats, float* reach, std::uint32_t* ids);
+                         Splat* splats, TileRect* rects, std::uint32_t* ids);
   void (*forward)(const TileList&, const Splat*, const Camera&, const Images&);
   // Adds to gradients. Without `map`, the colour gradients stay as they are.
   void (*backward)(const TileList&, const Splat*, const Camera&, const ConstImages& drawn, const ConstImages& gradient,

@@ -8,13 +8,9 @@ static inline Lanes splat(float value) { return Lanes{} + value; }
 
 static inline Lanes iota() { return Lanes{0, 1, 2, 3, 4, 5, 6, 7}; }
 
-static inline Lanes select(IntLanes mask, Lanes a) { return (Lanes)(mask & (IntLanes)a); }
+static inline Lanes min(Lanes a, Lanes b) { return a < b ? a : b; }
 
-static inline Lanes choose(IntLanes mask, Lanes a, Lanes b) { return (Lanes)((mask & (IntLanes)a) | (~mask & (IntLanes)b)); }
-
-static inline Lanes min(Lanes a, Lanes b) { return choose(a < b, a, b); }
-
-static inline Lanes max(Lanes a, Lanes b) { return choose(a > b, a, b); }
+static inline Lanes max(Lanes a, Lanes b) { return a > b ? a : b; }
 
 static inline Lanes load(const float* from) {
   Lanes value;
@@ -24,22 +20,20 @@ static inline Lanes load(const float* from) {
 
 static inline void store(float* to, Lanes value) { __builtin_memcpy(to, &value, sizeof value); }
 
-// exp on [-87, 88]: 2^n times a Taylor polynomial of degree 7 on half an octave (relative error below 1e-7).
+// exp of at most 88: 2^n times a Taylor polynomial on half an octave (relative error about 1e-7).
 static inline Lanes exp(Lanes x) {
-  x = max(min(x, splat(88.0f)), splat(-87.0f));
+  x = max(x, splat(-87.0f));
   const Lanes shifter = splat(12582912.0f);  // 1.5 * 2^23: adding it rounds to a whole number
   const Lanes n = (x * 1.44269504f + shifter) - shifter;
   const Lanes r = (x - n * 0.693359375f) + n * 2.12194440e-4f;  // ln 2 in two parts
-  Lanes p = splat(1.0f / 5040);
-  p = p * r + 1.0f / 720;
+  Lanes p = splat(1.0f / 720);
   p = p * r + 1.0f / 120;
   p = p * r + 1.0f / 24;
   p = p * r + 1.0f / 6;
   p = p * r + 0.5f;
   p = p * r + 1.0f;
   p = p * r + 1.0f;
-  const IntLanes scale = (__builtin_convertvector(n, IntLanes) + 127) << 23;
-  return p * (Lanes)scale;
+  return p * (Lanes)((__builtin_convertvector(n, IntLanes) + 127) << 23);
 }
 
 // An upper bound of ln x, at most 0.012 above it, for normal x.
@@ -50,6 +44,8 @@ static inline Lanes log_bound(Lanes x) {
   const Lanes log2_m = (m - 1.0f) * (splat(1.68f) - 0.34f * m) + 0.009f;
   return (exponent + log2_m) * 0.693147181f;
 }
+
+static inline Lanes keep(IntLanes mask, Lanes a) { return mask ? a : Lanes{}; }
 
 static inline Lanes sqrt(Lanes x) {
   Lanes root;
@@ -70,8 +66,28 @@ static inline Lanes row_sums(const Lanes* rows) {
          __builtin_shufflevector(b[0], b[1], 4, 5, 6, 7, 12, 13, 14, 15);
 }
 
+static inline float clamp(float x, float low, float high) { return x < low ? low : x > high ? high : x; }
+
+static inline TileRect touched_tiles(float u, float v, float extent, const Camera& camera) {
+  const float right = float(camera.width - 1), bottom = float(camera.height - 1);
+  TileRect rect;
+  rect.x0 = std::uint16_t(int(clamp(u - extent, 0.0f, right)) / kTile);
+  rect.x1 = std::uint16_t(int(clamp(u + extent, 0.0f, right)) / kTile);
+  rect.y0 = std::uint16_t(int(clamp(v - extent, 0.0f, bottom)) / kTile);
+  rect.y1 = std::uint16_t(int(clamp(v + extent, 0.0f, bottom)) / kTile);
+  rect.missed_corners = 0;
+  if (rect.x0 == rect.x1 || rect.y0 == rect.y1) return rect;
+  // Distance from the centre to the nearest pixel of the outer columns and rows.
+  const float left = clamp(u - float(rect.x0 * kTile + kTile - 1), 0.0f, 1e9f), above = clamp(v - float(rect.y0 * kTile + kTile - 1), 0.0f, 1e9f);
+  const float past = clamp(float(rect.x1 * kTile) - u, 0.0f, 1e9f), below = clamp(float(rect.y1 * kTile) - v, 0.0f, 1e9f);
+  const float limit = extent * extent;
+  rect.missed_corners = std::uint16_t((left * left + above * above > limit) | (past * past + above * above > limit) << 1 |
+                                      (left * left + below * below > limit) << 2 | (past * past + below * below > limit) << 3);
+  return rect;
+}
+
 static std::size_t project(const GaussianArrays& gaussians, const Camera& camera, const Pose& pose, std::size_t begin,
-                           std::size_t end, Splat* splats, float* reach, std::uint32_t* ids) {
+                           std::size_t end, Splat* splats, TileRect* rects, std::uint32_t* ids) {
   std::size_t visible = begin;
   const float focal = camera.focal();
   for (std::size_t first = begin; first < end; first += 8) {
@@ -90,9 +106,9 @@ static std::size_t project(const GaussianArrays& gaussians, const Camera& camera
     const Lanes inverse_z = 1.0f / cam_z;
     const Lanes u = camera.fx * cam_x * inverse_z + camera.cx;
     const Lanes v = camera.fy * cam_y * inverse_z + camera.cy;
-    const Lanes sigma = focal * exp(log_scale) * inverse_z;
+    const Lanes sigma = focal * exp(min(log_scale, splat(40.0f))) * inverse_z;
     const Lanes variance = sigma * sigma + kBlur;
-    const Lanes opacity = 1.0f / (1.0f + exp(-logit));
+    const Lanes opacity = 1.0f / (1.0f + exp(min(-logit, splat(80.0f))));
     const Lanes extent = sqrt(max(2.0f * variance * log_bound(255.0f * opacity), Lanes{}));
     const IntLanes drawn = (cam_z > kNear) & (opacity >= kMinAlpha) & (u + extent >= 0.0f) &
                            (u - extent <= float(camera.width - 1)) & (v + extent >= 0.0f) &
@@ -101,7 +117,7 @@ static std::size_t project(const GaussianArrays& gaussians, const Camera& camera
       if (!drawn[i]) continue;
       const float* rgb = gaussians.rgb + 3 * (first + i);
       splats[visible] = {u[i], v[i], -0.5f / variance[i], opacity[i], rgb[0], rgb[1], rgb[2], cam_z[i]};
-      reach[visible] = extent[i];
+      rects[visible] = touched_tiles(u[i], v[i], extent[i], camera);
       ids[visible] = std::uint32_t(first + i);
       ++visible;
     }
@@ -156,35 +172,63 @@ static inline void store_row(float* plane, const TileList& tile, const Camera& c
 }
 
 static inline void start_transmittance(Lanes* transmittance, const TileList& tile, const Camera& camera) {
-  for (int row = 0; row < kTile; ++row) transmittance[row] = select(on_image(tile, camera, row), splat(1.0f));
+  for (int row = 0; row < kTile; ++row) transmittance[row] = keep(on_image(tile, camera, row), splat(1.0f));
 }
 
+struct Row {  // eight pixels being blended
+  Lanes T, r, g, b, depth, silhouette;
+};
+
+static inline void blend(Row& row, Lanes raw_alpha, const Splat& s) {
+  const Lanes alpha = min(raw_alpha, splat(kMaxAlpha));
+  const Lanes w = keep((alpha >= kMinAlpha) & (row.T >= kMinTransmittance), alpha * row.T);
+  row.r += w * s.r;
+  row.g += w * s.g;
+  row.b += w * s.b;
+  row.depth += w * s.z;
+  row.silhouette += w;
+  row.T -= w;
+}
+
+static inline bool opaque(const Row* rows) {
+  Lanes T[kTile];
+  for (int row = 0; row < kTile; ++row) T[row] = rows[row].T;
+  return opaque(T);
+}
+
+// Splats are taken in batches, two rows at a time: the pixels stay in registers, and while one row's transmittance
+// waits for its last splat, the other's moves on.
 static void forward(const TileList& tile, const Splat* splats, const Camera& camera, const Images& images) {
+  constexpr std::size_t kBatch = 16;
   const std::size_t plane = std::size_t(camera.width) * camera.height;
-  Lanes T[kTile], r[kTile] = {}, g[kTile] = {}, b[kTile] = {}, depth[kTile] = {}, silhouette[kTile] = {};
-  start_transmittance(T, tile, camera);
-  for (std::size_t i = 0; i < tile.count; ++i) {
-    if (i % 8 == 7 && opaque(T)) break;
-    const Splat& s = splats[tile.splats[i]];
-    const Footprint f = footprint(s, tile);
-    for (int row = 0; row < kTile; ++row) {
-      if (f.down[row] < kMinAlpha) continue;
-      const Lanes alpha = min(f.down[row] * f.across, splat(kMaxAlpha));
-      const Lanes w = select((alpha >= kMinAlpha) & (T[row] >= kMinTransmittance), alpha * T[row]);
-      r[row] += w * s.r;
-      g[row] += w * s.g;
-      b[row] += w * s.b;
-      depth[row] += w * s.z;
-      silhouette[row] += w;
-      T[row] -= w;
+  Row rows[kTile] = {};
+  for (int row = 0; row < kTile; ++row) rows[row].T = keep(on_image(tile, camera, row), splat(1.0f));
+  Splat batch[kBatch];
+  Footprint prints[kBatch];
+  for (std::size_t first = 0; first < tile.count && !opaque(rows); first += kBatch) {
+    const std::size_t size = tile.count - first < kBatch ? tile.count - first : kBatch;
+    for (std::size_t i = 0; i < size; ++i) {
+      batch[i] = splats[tile.splats[first + i]];
+      prints[i] = footprint(batch[i], tile);
+    }
+    for (int row = 0; row < kTile; row += 2) {
+      Row upper = rows[row], lower = rows[row + 1];
+      for (std::size_t i = 0; i < size; ++i) {
+        const Footprint& f = prints[i];
+        if ((f.down[row] < kMinAlpha) & (f.down[row + 1] < kMinAlpha)) continue;
+        blend(upper, f.down[row] * f.across, batch[i]);
+        blend(lower, f.down[row + 1] * f.across, batch[i]);
+      }
+      rows[row] = upper;
+      rows[row + 1] = lower;
     }
   }
   for (int row = 0; row < kTile; ++row) {
-    store_row(images.rgb, tile, camera, row, r[row]);
-    store_row(images.rgb + plane, tile, camera, row, g[row]);
-    store_row(images.rgb + 2 * plane, tile, camera, row, b[row]);
-    store_row(images.depth, tile, camera, row, depth[row]);
-    store_row(images.silhouette, tile, camera, row, silhouette[row]);
+    store_row(images.rgb, tile, camera, row, rows[row].r);
+    store_row(images.rgb + plane, tile, camera, row, rows[row].g);
+    store_row(images.rgb + 2 * plane, tile, camera, row, rows[row].b);
+    store_row(images.depth, tile, camera, row, rows[row].depth);
+    store_row(images.silhouette, tile, camera, row, rows[row].silhouette);
   }
 }
 
@@ -217,10 +261,10 @@ static inline void backward_tile(const TileList& tile, const Splat* splats, cons
       const Lanes raw = f.down[row] * f.across;
       const Lanes alpha = min(raw, splat(kMaxAlpha));
       const IntLanes blended = (alpha >= kMinAlpha) & (T[row] >= kMinTransmittance);
-      const Lanes w = select(blended, alpha * T[row]);
+      const Lanes w = keep(blended, alpha * T[row]);
       const Lanes q = gr[row] * s.r + gg[row] * s.g + gb[row] * s.b + gd[row] * s.z + gs[row];
       Q[row] -= w * q;
-      const Lanes slope = select(blended & (raw <= kMaxAlpha), alpha * (T[row] * q - Q[row] / (1.0f - alpha)));
+      const Lanes slope = keep(blended & (raw <= kMaxAlpha), alpha * (T[row] * q - Q[row] / (1.0f - alpha)));
       const Lanes slope_dy = slope * f.dy[row];
       sums[0] += slope;
       sums[2] += slope_dy;

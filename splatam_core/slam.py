@@ -1,0 +1,161 @@
+"""SplaTAM (Keetha et al., CVPR 2024): splat, track and map, one frame at a time."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatam_core import se3
+from splatam_core.camera import PinholeCamera
+from splatam_core.config import SlamConfig
+from splatam_core.densification import densify
+from splatam_core.errors import FrameError, SplatamError
+from splatam_core.gaussian_map import GaussianMap
+from splatam_core.keyframes import PosedView, select_window
+from splatam_core.mapping import refine
+from splatam_core.motion import MotionModel
+from splatam_core.rasterizer import make_rasterizer
+from splatam_core.tracking import RenderAndCompareTracker
+from splatam_core.types import FrameResult, MapSnapshot, RenderedView, RgbdFrame, StageTimings, Status
+from splatam_core.view import View
+
+Matrix = NDArray[np.float64]
+
+
+class Slam:
+    """The algorithm, synchronous and without threads of its own."""
+
+    def __init__(self, config: SlamConfig) -> None:
+        self.config = config
+        self._rasterizer = make_rasterizer(config.rasterizer, config.threads)
+        self._tracker = RenderAndCompareTracker(self._rasterizer, config.tracking)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget map, poses and camera; the next frame starts a new world."""
+        self.map = GaussianMap()
+        self.camera: PinholeCamera | None = None
+        self._keyframes: list[PosedView] = []
+        self._motion = MotionModel(self.config.tracking.motion_model == 'constant_velocity')
+        self._rng = np.random.default_rng(self.config.seed)
+        self._scene_radius = 0.0
+        self._num_frames = 0
+        self._last_stamp_ns: int | None = None
+
+    @property
+    def num_gaussians(self) -> int:
+        """Size of the map."""
+        return len(self.map)
+
+    def process(self, frame: RgbdFrame) -> FrameResult:
+        """Find where a frame was taken from, and teach the map what it shows.
+
+        Raises:
+            FrameError: the frame is of another camera than the first, or not later than the last.
+        """
+        self._check(frame)
+        clock = _Stopwatch()
+        index, self._num_frames, self._last_stamp_ns = self._num_frames, self._num_frames + 1, frame.stamp_ns
+        view = View.from_frame(frame, self.config.depth)
+        if self.num_gaussians == 0:
+            return self._initialize(index, frame, view, clock)
+
+        guess = se3.inverse(self._motion.predict(frame.stamp_ns))
+        tracking = self._tracker.track(view, self.map.gaussians, guess)
+        clock.lap('track')
+        if tracking.failure:
+            self._motion.stop()
+            return self._result(index, frame, Status.LOST, None, False, clock, tracking.failure,
+                                tracking.sure_fraction, tracking.inlier_fraction)  # fmt: skip
+
+        T_world_cam = se3.inverse(tracking.T_cam_world)
+        self._motion.observe(frame.stamp_ns, T_world_cam)
+        is_keyframe = self._map(index, _posed(view, tracking.T_cam_world), clock)
+        return self._result(index, frame, Status.TRACKED, T_world_cam, is_keyframe, clock, '',
+                            tracking.sure_fraction, tracking.inlier_fraction)  # fmt: skip
+
+    def render(self, T_world_cam: Matrix) -> RenderedView:
+        """What the map looks like from a pose, through the frames' camera.
+
+        Raises:
+            SplatamError: no frame has been processed yet.
+        """
+        if self.camera is None:
+            raise SplatamError('nothing can be rendered before the first frame: the camera is not known')
+        T_cam_world = torch.from_numpy(se3.inverse(T_world_cam)).float()
+        with torch.no_grad():
+            render = self._rasterizer.render(self.map.gaussians.detached(), self.camera, T_cam_world)
+        rgb = render.rgb.clamp(0, 1).mul(255).round().byte().permute(1, 2, 0).contiguous()
+        return RenderedView(rgb.numpy(), render.depth().numpy(), render.silhouette.numpy())
+
+    def snapshot(self) -> MapSnapshot:
+        """A copy of the map."""
+        return self.map.snapshot()
+
+    def _check(self, frame: RgbdFrame) -> None:
+        if self.camera is not None and frame.camera != self.camera:
+            raise FrameError(f'the camera changed from {self.camera} to {frame.camera}; reset to start a new map')
+        if self._last_stamp_ns is not None and frame.stamp_ns <= self._last_stamp_ns:
+            raise FrameError(
+                f'frame stamp {frame.stamp_ns} ns is not after the last one, {self._last_stamp_ns} ns; '
+                'reset to go back in time'
+            )
+        self.camera = frame.camera
+
+    def _initialize(self, index: int, frame: RgbdFrame, view: View, clock: _Stopwatch) -> FrameResult:
+        if not view.valid.any():
+            reason = 'the map cannot start: no pixel has a usable depth reading'
+            return self._result(index, frame, Status.LOST, None, False, clock, reason, 0.0, 0.0)
+        self._scene_radius = float(view.depth.max()) / self.config.mapping.scene_radius_ratio
+        self._motion.observe(frame.stamp_ns, np.eye(4))
+        self._map(0, _posed(view, np.eye(4)), clock)
+        return self._result(index, frame, Status.INITIALIZED, np.eye(4), True, clock, '', 1.0, 1.0)
+
+    def _map(self, index: int, current: PosedView, clock: _Stopwatch) -> bool:
+        """Densify, choose a window, refine; keep the view if it is due. Whether it was."""
+        config = self.config
+        if index % config.mapping.every == 0:
+            self.map.append(
+                densify(self.map.gaussians, current.view, current.T_cam_world, self._rasterizer, config.densification)
+            )
+            clock.lap('densify')
+            window = select_window(current, self._keyframes, config.keyframes, self._rng)
+            clock.lap('keyframes')
+            refine(self.map, window, self._rasterizer, config.mapping, self._scene_radius, self._rng)
+            clock.lap('map')
+        is_keyframe = index % config.keyframes.every == 0
+        if is_keyframe:
+            self._keyframes.append(current)
+        return is_keyframe
+
+    def _result(
+        self, index: int, frame: RgbdFrame, status: Status, T_world_cam: Matrix | None, is_keyframe: bool,
+        clock: _Stopwatch, reason: str, sure_fraction: float, inlier_fraction: float,
+    ) -> FrameResult:  # fmt: skip
+        return FrameResult(
+            index, frame.stamp_ns, status, T_world_cam, is_keyframe, self.num_gaussians,
+            sure_fraction, inlier_fraction, reason, clock.timings(),
+        )  # fmt: skip
+
+
+def _posed(view: View, T_cam_world: Matrix) -> PosedView:
+    return PosedView(view, torch.from_numpy(T_cam_world).float())
+
+
+@dataclass(slots=True)
+class _Stopwatch:
+    started: float = field(default_factory=time.perf_counter)
+    lapped: float = field(default_factory=time.perf_counter)
+    laps: dict[str, float] = field(default_factory=dict)
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.laps[stage] = 1e3 * (now - self.lapped)
+        self.lapped = now
+
+    def timings(self) -> StageTimings:
+        return StageTimings(**self.laps, total=1e3 * (time.perf_counter() - self.started))

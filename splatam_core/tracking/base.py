@@ -1,0 +1,60 @@
+"""What every tracker returns, and how a tracked pose is judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatam_core.config import TrackingConfig
+from splatam_core.rasterizer import Gaussians, Render
+from splatam_core.view import View
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackingResult:
+    """A pose and the evidence for it.
+
+    Attributes:
+        T_cam_world: [4, 4] float64.
+        sure_fraction: share of the pixels with depth that see sure map.
+        inlier_fraction: share of those that agree with the map in depth and colour.
+        failure: why the pose must not be used; empty where it may be.
+    """
+
+    T_cam_world: NDArray[np.float64]
+    sure_fraction: float
+    inlier_fraction: float
+    failure: str
+
+
+class Tracker(Protocol):
+    """A way to find the camera."""
+
+    def track(self, view: View, gaussians: Gaussians, T_cam_world: NDArray[np.float64]) -> TrackingResult:
+        """Find the pose from which the map looks like the view, from a first guess; changes nothing."""
+        ...
+
+
+def judge(T_cam_world: NDArray[np.float64], render: Render, view: View, config: TrackingConfig) -> TrackingResult:
+    """Hold the map, rendered at a pose, against the view: is this where the camera is?"""
+    readings = int(view.valid.sum())
+    sure = view.valid & (render.silhouette > config.silhouette_threshold)
+    depth_agrees = (render.depth() - view.depth).abs() <= config.inlier_depth * view.depth
+    color_agrees = (render.rgb - view.rgb).abs().mean(dim=0) <= config.inlier_color
+    num_sure = int(sure.sum())
+    sure_fraction = num_sure / max(1, readings)
+    inlier_fraction = int((sure & depth_agrees & color_agrees).sum()) / max(1, num_sure)
+    failure = ''
+    if not np.isfinite(T_cam_world).all():
+        failure = 'tracking diverged: the pose is not finite'
+    elif readings == 0:
+        failure = 'no pixel has a usable depth reading'
+    elif sure_fraction < config.min_sure_fraction:
+        failure = f'only {sure_fraction:.0%} of the view is mapped (at least {config.min_sure_fraction:.0%} needed)'
+    elif inlier_fraction < config.min_inlier_fraction:
+        failure = f'only {inlier_fraction:.0%} of it agrees with the map (at least {config.min_inlier_fraction:.0%} needed)'
+    return TrackingResult(T_cam_world, sure_fraction, inlier_fraction, failure)

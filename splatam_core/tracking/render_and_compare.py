@@ -1,0 +1,68 @@
+"""The paper's tracker (section 3.2): Adam on the pose, through the renderer, where the silhouette is sure."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from splatam_core import se3
+from splatam_core.config import TrackingConfig
+from splatam_core.losses import tracking_loss
+from splatam_core.rasterizer import Gaussians, Rasterizer
+from splatam_core.tracking.base import TrackingResult, judge
+from splatam_core.view import View
+
+
+class RenderAndCompareTracker:
+    """Keeps the pose with the lowest loss of all it evaluated, the first guess included."""
+
+    def __init__(self, rasterizer: Rasterizer, config: TrackingConfig) -> None:
+        self._rasterizer = rasterizer
+        self._config = config
+
+    def track(self, view: View, gaussians: Gaussians, T_cam_world: NDArray[np.float64]) -> TrackingResult:
+        """See ``Tracker.track``."""
+        config, gaussians = self._config, gaussians.detached()
+        rotation = torch.tensor(se3.quaternion_from_rotation(T_cam_world[:3, :3]), dtype=torch.float32)
+        translation = torch.tensor(T_cam_world[:3, 3], dtype=torch.float32)
+        optimizer = torch.optim.Adam(
+            [
+                {'params': [rotation.requires_grad_()], 'lr': config.rotation_rate},
+                {'params': [translation.requires_grad_()], 'lr': config.translation_rate},
+            ]
+        )
+        best_loss, best_pose, best_render = float('inf'), _pose(rotation, translation).detach(), None
+        for step in range(config.iterations + 1):
+            pose = _pose(rotation, translation)
+            render = self._rasterizer.render(gaussians, view.camera, pose)
+            loss = tracking_loss(
+                render, view, config.silhouette_threshold, config.color_weight, config.depth_weight
+            )
+            if best_render is None or loss.item() < best_loss:
+                best_loss, best_pose, best_render = loss.item(), pose.detach(), render
+            if step < config.iterations:
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+        return judge(_float64(best_pose), best_render, view, config)
+
+
+def _pose(quaternion: Tensor, translation: Tensor) -> Tensor:
+    """[4, 4] from a quaternion (w, x, y, z) of any length and a translation, differentiably."""
+    w, x, y, z = (quaternion / quaternion.norm()).unbind()
+    one, zero = torch.ones_like(w), torch.zeros_like(w)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), translation[0]],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x), translation[1]],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y), translation[2]],
+        [zero, zero, zero, one],
+    ]
+    return torch.stack([entry for row in rows for entry in row]).view(4, 4)
+
+
+def _float64(pose: Tensor) -> NDArray[np.float64]:
+    """The pose in double precision, its rotation orthonormal to that precision too."""
+    T = pose.double().numpy()
+    return se3.compose(se3.quaternion_from_rotation(T[:3, :3]), T[:3, 3])

@@ -1,0 +1,80 @@
+"""A frame as the stages see it: tensors, with the readings that count."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from splatam_core.camera import PinholeCamera
+from splatam_core.config import DepthConfig
+from splatam_core.types import RgbdFrame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """One frame's images.
+
+    Attributes:
+        camera: the pinhole of all three.
+        rgb: [3, H, W] in [0, 1].
+        depth: [H, W] metres, 0 = no reading.
+        valid: [H, W] bool, where there is a reading.
+    """
+
+    camera: PinholeCamera
+    rgb: Tensor
+    depth: Tensor
+    valid: Tensor
+
+    @classmethod
+    def from_frame(cls, frame: RgbdFrame, config: DepthConfig) -> View:
+        """The frame's images, with only the depth readings that count."""
+        return cls._from_images(frame.camera, frame.rgb, usable_depth(frame.depth_m, config))
+
+    @classmethod
+    def _from_images(cls, camera: PinholeCamera, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> View:
+        colour = torch.from_numpy(rgb).permute(2, 0, 1).float().div_(255).contiguous()
+        depth = torch.from_numpy(depth_m)
+        return cls(camera, colour, depth, depth > 0)
+
+    def scaled(self, scale: float) -> View:
+        """The same view at another resolution: colour by area, depth by nearest."""
+        if scale == 1.0:
+            return self
+        size = max(1, round(self.camera.width * scale)), max(1, round(self.camera.height * scale))
+        rgb = cv2.resize(self.rgb.permute(1, 2, 0).numpy(), size, interpolation=cv2.INTER_AREA)
+        depth = cv2.resize(self.depth.numpy(), size, interpolation=cv2.INTER_NEAREST_EXACT)
+        depth_tensor = torch.from_numpy(depth)
+        colour = torch.from_numpy(rgb).permute(2, 0, 1).contiguous()
+        return View(self.camera.resized(*size), colour, depth_tensor, depth_tensor > 0)
+
+    def points(self, chosen: Tensor) -> Tensor:
+        """[K, 3] camera coordinates of the pixels where ``chosen`` [H, W] is true, row by row."""
+        v, u = torch.nonzero(chosen, as_tuple=True)
+        return unproject(self.camera, u, v, self.depth[v, u])
+
+
+def unproject(camera: PinholeCamera, u: Tensor, v: Tensor, z: Tensor) -> Tensor:
+    """[K, 3] camera coordinates of pixels (u, v) at depth z."""
+    return torch.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], dim=1)
+
+
+def usable_depth(depth_m: NDArray[np.float32], config: DepthConfig) -> NDArray[np.float32]:
+    """[H, W] the readings inside the configured range and off depth edges; 0 elsewhere."""
+    usable = (depth_m >= config.min_m) & (depth_m <= config.max_m)
+    if config.edge_filter > 0:
+        usable &= ~_is_flying(depth_m, config.edge_filter)
+    return np.where(usable, depth_m, np.float32(0))
+
+
+def _is_flying(depth_m: NDArray[np.float32], ratio: float) -> NDArray[np.bool_]:
+    """Readings that hang between two surfaces: some neighbour with a reading is far nearer or farther."""
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    farthest = cv2.dilate(depth_m, cross)
+    nearest = cv2.erode(np.where(depth_m > 0, depth_m, np.float32(np.inf)), cross)
+    return (farthest - depth_m > ratio * depth_m) | (depth_m - nearest > ratio * depth_m)
