@@ -11,6 +11,7 @@ FINDABLE = $(foreach name,python3 python3.12 python3.11 python3.10,$(shell $(nam
 CHECK_PYTHON := import sys; sys.exit(0 if (3, 10) <= sys.version_info < (3, 13) else 1)
 PYTHON ?= $(firstword $(FINDABLE))
 export SPLATAM_DATA ?= $(abspath ../shared/data)
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .PHONY: help setup test demo colcon check-aarch64 clean
 
@@ -39,7 +40,7 @@ $(VENV)/.native: $(CSRC) setup.py package.xml constraints.txt | $(VENV)/.created
 
 $(VENV)/.installed: setup.py package.xml pyproject.toml constraints.txt $(VENV)/.native
 	@echo 'installing what splatam_ros needs into $(VENV): some minutes the first time'
-	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[ros,test]'
+	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[ros,test]'
 	touch $@
 
 test: setup

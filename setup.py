@@ -14,6 +14,9 @@ from xml.etree import ElementTree
 from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
 
+if sys.version_info < (3, 10):
+    sys.exit(f'splatam_ros: Python {sys.version.split()[0]} is too old: install Python 3.10, 3.11 or 3.12')
+
 NAME = 'splatam_ros'
 TOP_LEVEL = (NAME, 'splatam_core', 'msg_adapters')
 CSRC = 'splatam_core/rasterizer/csrc'
@@ -39,8 +42,6 @@ def pybind11_include_dirs() -> list[str] | None:
 def missing_for_build() -> str | None:
     """What has to be installed before the extension can be built, in one line."""
     compiler = shlex.split(os.environ.get('CXX') or sysconfig.get_config_var('CXX') or 'g++')[0]
-    if sys.version_info < (3, 10):
-        return f'Python {sys.version.split()[0]} is too old: install Python 3.10, 3.11 or 3.12'
     if shutil.which(compiler) is None:
         return f"no C++ compiler (looked for '{compiler}'): apt install g++ python3-dev, or set CXX"
     if not Path(sysconfig.get_path('include'), 'Python.h').is_file():
