@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from splatam_core.errors import MapFileError
 from splatam_core.files import replaced
-from splatam_core.rasterizer.base import Gaussians
+from splatam_core.rasterizer import Gaussians
 
 SH_C0 = 0.28209479177387814
 """Value of the zeroth spherical harmonic, 1 / (2 sqrt(pi))."""

@@ -17,7 +17,7 @@ import csv
 import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from types import TracebackType
@@ -177,7 +177,7 @@ class RunFolder:
 
     def save(self, slam: Slam) -> Metrics:
         """Write ``map.ply`` and ``metrics.json`` as of now; may be called again later."""
-        gaussians = slam.gaussians()
+        gaussians = slam.map.gaussians
         write_ply(self.path / MAP, gaussians)
         metrics = run_metrics(self._records, len(gaussians), environment.peak_rss_mb())
         replace_text(self.path / METRICS, metrics.to_json())

@@ -7,7 +7,7 @@ sides, which would count it as a perfect one.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -17,8 +17,9 @@ from torch import Tensor
 from splatam_core import se3
 from splatam_core.config import DepthConfig
 from splatam_core.losses import ssim_map
-from splatam_core.rasterizer.base import Gaussians, Rasterizer, Render
+from splatam_core.rasterizer import Gaussians, Rasterizer, Render
 from splatam_core.types import RgbdFrame
+from splatam_core.view import View
 
 MIN_SQUARED_ERROR = 1e-10
 """Identical images score 100 dB, not infinity: that is no number in JSON, nor can it be averaged."""
@@ -60,13 +61,18 @@ class ViewScorer:
     Args:
         gaussians: the map.
         rasterizer: draws it.
-        depth: which readings count.
+        depth: the range in which readings count. Its edge filter does not apply: a run that closes its eyes to
+            hard pixels is scored on them all the same.
     """
 
     def __init__(self, gaussians: Gaussians, rasterizer: Rasterizer, depth: DepthConfig) -> None:
         self._gaussians = gaussians.detached()
         self._rasterizer = rasterizer
-        self._depth = depth
+        self._depth = replace(depth, edge_filter=0.0)
+
+    def view(self, frame: RgbdFrame) -> View:
+        """The frame's images, with the depth readings that count."""
+        return View.from_frame(frame, self._depth)
 
     def render(self, frame: RgbdFrame, T_world_cam: NDArray[np.float64]) -> Render:
         """The map from a pose, in the frame's camera."""
@@ -74,16 +80,10 @@ class ViewScorer:
         with torch.no_grad():
             return self._rasterizer.render(self._gaussians, frame.camera, T_cam_world)
 
-    def has_reading(self, frame: RgbdFrame) -> NDArray[np.bool_]:
-        """[H, W] where the frame's depth counts."""
-        return (frame.depth_m >= self._depth.min_m) & (frame.depth_m <= self._depth.max_m) & (frame.depth_m > 0)
-
     def score(self, frame: RgbdFrame, T_world_cam: NDArray[np.float64]) -> FrameScores:
         """How the map at a pose matches the frame taken there."""
-        render = self.render(frame, T_world_cam)
-        rgb = torch.from_numpy(frame.rgb).permute(2, 0, 1).to(torch.float32) / 255  # [3, H, W]
-        mask, depth_m = torch.from_numpy(self.has_reading(frame)), torch.from_numpy(frame.depth_m)
-        return FrameScores(frame.stamp_ns, score_view(render.rgb, render.depth(), rgb, depth_m, mask))
+        render, view = self.render(frame, T_world_cam), self.view(frame)
+        return FrameScores(frame.stamp_ns, score_view(render.rgb, render.depth(), view.rgb, view.depth, view.valid))
 
 
 def score_view(rendered: Tensor, rendered_depth_m: Tensor, rgb: Tensor, depth_m: Tensor, mask: Tensor) -> ImageScores:

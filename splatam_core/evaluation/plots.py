@@ -164,9 +164,9 @@ def sample_images(axes: NDArray[np.object_], sample: Sample) -> tuple[AxesImage,
         The images that a colour bar explains: colour difference, depth, depth difference.
     """
     frame = sample.frame
-    reading = np.where(sample.has_reading, frame.depth_m, np.nan)
+    reading = np.where(sample.reading_m > 0, sample.reading_m, np.nan)
     rendered = np.where(sample.depth_m > 0, sample.depth_m, np.nan)
-    difference_cm = np.where(sample.has_reading, np.abs(sample.depth_m - frame.depth_m), np.nan) * 100
+    difference_cm = np.abs(sample.depth_m - reading) * 100
     rgb_difference = np.abs(sample.rgb - frame.rgb / 255).mean(axis=2)
     depth_norm, difference_norm = _depth_norm(reading, rendered), Normalize(0, _difference_limit_cm(difference_cm))
     axes[0].imshow(frame.rgb)

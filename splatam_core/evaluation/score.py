@@ -29,7 +29,7 @@ class Sample:
     Attributes:
         title: which one it is.
         frame: what the camera saw.
-        has_reading: [H, W] bool, where its depth counts.
+        reading_m: [H, W] float32, its depth where that counts; 0 elsewhere.
         rgb: [H, W, 3] float32 in [0, 1], rendered.
         depth_m: [H, W] float32, rendered; 0 = none.
         scores: how well the two match.
@@ -37,7 +37,7 @@ class Sample:
 
     title: str
     frame: RgbdFrame
-    has_reading: NDArray[np.bool_]
+    reading_m: NDArray[np.float32]
     rgb: NDArray[np.float32]
     depth_m: NDArray[np.float32]
     scores: FrameScores
@@ -180,7 +180,7 @@ def _sample(
 ) -> Sample:
     render = scorer.render(frame, T_world_cam)
     rgb = render.rgb.clamp(0, 1).permute(1, 2, 0).numpy()
-    return Sample(title, frame, scorer.has_reading(frame), rgb, render.depth().numpy(), scores)
+    return Sample(title, frame, scorer.view(frame).depth.numpy(), rgb, render.depth().numpy(), scores)
 
 
 def _none_found(run: RunRecord, sequence: Sequence) -> str:

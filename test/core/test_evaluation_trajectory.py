@@ -1,0 +1,143 @@
+"""The absolute trajectory error against cases whose answer is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splatam_core import se3
+from splatam_core.errors import RunFolderError
+from splatam_core.evaluation.trajectory import (
+    MAX_TRUTH_GAP_NS,
+    STAMP_ROUNDING_NS,
+    align,
+    interpolate_centres,
+    trajectory_error,
+    transformed,
+)
+from splatam_core.types import Trajectory
+
+EPOCH_NS = 1_700_000_000_123_456_789
+STEP_NS = 33_333_333
+ROUND_OFF_M = 1e-12  # a few metres in 64-bit floats
+
+
+def wandering(count: int, seed: int = 0) -> Trajectory:
+    """A path that turns and moves in all directions."""
+    steps = np.random.default_rng(seed).normal(0, 0.05, (count, 6))
+    poses = [np.eye(4)]
+    for step in steps[1:]:
+        poses.append(poses[-1] @ se3.exp(step))
+    return Trajectory(EPOCH_NS + STEP_NS * np.arange(count), np.array(poses))
+
+
+def moved(trajectory: Trajectory, offsets: np.ndarray) -> Trajectory:
+    """The same with its camera centres shifted, each by its own offset."""
+    T = trajectory.T_world_cam.copy()
+    T[:, :3, 3] += offsets
+    return Trajectory(trajectory.stamps_ns, T)
+
+
+def square(centre_noise: np.ndarray) -> tuple[Trajectory, Trajectory]:
+    """Truth at the corners of a square of side 2 about the origin, and an estimate that is off by the noise."""
+    corners = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]], dtype=float)
+    truth = Trajectory(EPOCH_NS + STEP_NS * np.arange(4), se3.compose(np.tile([1.0, 0, 0, 0], (4, 1)), corners))
+    return moved(truth, centre_noise), truth
+
+
+def test_known_noise_gives_the_error_by_hand() -> None:
+    # Up, down, up, down by 3 cm: no motion of the square (shift, tilt, turn) follows that, so all of it is error.
+    noise = np.array([[0, 0, 0.03], [0, 0, -0.03], [0, 0, 0.03], [0, 0, -0.03]])
+    assert trajectory_error(*square(noise)).rmse_m == pytest.approx(0.03, abs=ROUND_OFF_M)
+
+
+def test_scale_is_not_aligned_away() -> None:
+    estimate, truth = square(np.zeros((4, 3)))
+    grown = moved(truth, 0.1 * truth.T_world_cam[:, :3, 3])
+    # Each corner lies sqrt(2) from the centre, and a tenth of that too far out.
+    assert trajectory_error(grown, truth).rmse_m == pytest.approx(0.1 * np.sqrt(2), abs=ROUND_OFF_M)
+    assert trajectory_error(estimate, truth).rmse_m == pytest.approx(0, abs=ROUND_OFF_M)
+
+
+def test_a_mirror_image_is_not_aligned_away() -> None:
+    truth = wandering(50)
+    mirrored = Trajectory(truth.stamps_ns, truth.T_world_cam.copy())
+    mirrored.T_world_cam[:, 0, 3] *= -1
+    T = trajectory_error(mirrored, truth).T_estimate_truth
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+    assert trajectory_error(mirrored, truth).rmse_m > 0.01
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_where_the_truth_has_its_world_changes_nothing(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = wandering(80)
+    estimate = moved(truth, rng.normal(0, 0.02, (80, 3)))
+    T = se3.exp(rng.normal(0, 2, 6))
+    here, there = trajectory_error(estimate, truth), trajectory_error(estimate, transformed(truth, T))
+    assert there.rmse_m == pytest.approx(here.rmse_m, abs=ROUND_OFF_M)
+    np.testing.assert_allclose(there.truth_m, here.truth_m, atol=1e-10)  # cancels T and its inverse
+
+
+def test_independent_noise_shows_in_full() -> None:
+    truth, sigma, count = wandering(2000), 0.02, 2000
+    noise = np.random.default_rng(1).normal(0, sigma, (count, 3))
+    # 3 N noisy numbers less the 6 a rigid motion fits; the sum of squares strays by sqrt(2 / 3 N) = 1.8 %, half in the root.
+    expected = sigma * np.sqrt(3 * (1 - 6 / (3 * count)))
+    assert trajectory_error(moved(truth, noise), truth).rmse_m == pytest.approx(expected, rel=0.03)
+
+
+def test_alignment_finds_the_motion() -> None:
+    rng = np.random.default_rng(2)
+    points, T = rng.normal(size=(20, 3)), se3.exp(rng.normal(size=6))
+    np.testing.assert_allclose(align(points, points @ T[:3, :3].T + T[:3, 3]), T, atol=ROUND_OFF_M)
+
+
+def test_alignment_is_the_least_squares_one() -> None:
+    rng = np.random.default_rng(3)
+    source, target = rng.normal(size=(30, 3)), rng.normal(size=(30, 3))
+    best = align(source, target)
+
+    def cost(T: np.ndarray) -> float:
+        return float(np.sum((source @ T[:3, :3].T + T[:3, 3] - target) ** 2))
+
+    assert all(cost(se3.exp(rng.normal(0, 0.01, 6)) @ best) > cost(best) for _ in range(50))
+
+
+def test_truth_is_interpolated_at_the_stamp_of_the_frame() -> None:
+    ends = se3.compose(np.tile([1.0, 0, 0, 0], (2, 1)), np.array([[0.0, 0, 0], [4.0, -8.0, 2.0]]))
+    truth = Trajectory(EPOCH_NS + np.array([0, 40_000_000]), ends)
+    centres, known = interpolate_centres(truth, EPOCH_NS + np.array([0, 10_000_000, 40_000_000]))
+    assert known.all()
+    np.testing.assert_allclose(centres, [[0, 0, 0], [1, -2, 0.5], [4, -8, 2]], atol=ROUND_OFF_M)
+
+
+def test_frames_without_a_truth_are_not_scored() -> None:
+    truth = wandering(100)
+    keep = np.r_[10:40, 60:90]
+    partial = Trajectory(truth.stamps_ns[keep], truth.T_world_cam[keep])
+    assert truth.stamps_ns[60] - truth.stamps_ns[39] > MAX_TRUTH_GAP_NS
+    wild = moved(truth, np.where(np.isin(np.arange(100), keep), 0.0, 50.0)[:, None])
+    error = trajectory_error(wild, partial)
+    np.testing.assert_array_equal(error.stamps_ns, partial.stamps_ns)
+    assert error.rmse_m == pytest.approx(0, abs=ROUND_OFF_M)
+
+
+def test_rounded_stamps_at_the_ends_still_count() -> None:
+    truth = wandering(5)
+    just_outside = np.array([truth.stamps_ns[0] - STAMP_ROUNDING_NS, truth.stamps_ns[-1] + STAMP_ROUNDING_NS])
+    too_far = just_outside + [-1, 1]
+    assert interpolate_centres(truth, just_outside)[1].all()
+    assert not interpolate_centres(truth, too_far)[1].any()
+
+
+def test_other_clock_is_an_error_that_names_both_spans() -> None:
+    truth = wandering(10)
+    later = Trajectory(truth.stamps_ns + 10**12, truth.T_world_cam)
+    with pytest.raises(RunFolderError, match=r'0 of 10 .* 1700001000\.1\d+ .* 1700000000\.1\d+'):
+        trajectory_error(later, truth)
+    with pytest.raises(RunFolderError, match='2 of 2'):
+        trajectory_error(Trajectory(truth.stamps_ns[:2], truth.T_world_cam[:2]), truth)
+    nothing = Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
+    with pytest.raises(RunFolderError, match='the truth nothing'):
+        trajectory_error(truth, nothing)

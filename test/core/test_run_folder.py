@@ -1,0 +1,221 @@
+"""Run folders: written line by line, never overwritten by accident, read back whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatam_core import environment, se3
+from splatam_core.camera import PinholeCamera
+from splatam_core.config import load_config
+from splatam_core.errors import RunFolderError
+from splatam_core.evaluation.metrics import Metrics, StageStatistics
+from splatam_core.ply import read_ply
+from splatam_core.run_folder import RunDescription, RunFolder, Source, read_run, run_metrics
+from splatam_core.slam import Slam
+from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status
+
+CAMERA = PinholeCamera(48, 36, 40.0, 40.0, 23.5, 17.5)
+CONFIG = load_config('quick', ['threads=1', 'tracking.iterations=3', 'mapping.iterations=2'])
+NODE = RunDescription('splatam_node', 'quick')
+OFFLINE = RunDescription('splatam run', 'quick', Source('/data/room', width=48, rgb='/camera/rgb'))
+STEP_NS = 33_333_333
+
+
+def frame(index: int) -> RgbdFrame:
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    rgb = np.stack([u * 5, v * 7, (u + v) * 3 % 255], axis=-1).astype(np.uint8)
+    return RgbdFrame(10**18 + index * STEP_NS, rgb, np.full(u.shape, 1.5, np.float32), CAMERA)
+
+
+def result(index: int, status: Status = Status.TRACKED, total_ms: float = 10.0) -> FrameResult:
+    pose = None if status is Status.LOST else se3.exp(np.array([0.01, 0.02, -0.01, 0.1, 0, 0.05]) * index)
+    reason = 'too few inliers, "bad"' if pose is None else ''
+    timings = StageTimings(track=total_ms * 0.6, map=total_ms * 0.4, total=total_ms)
+    return FrameResult(index, frame(index).stamp_ns, status, pose, index % 2 == 0, 100 + index, 0.9, 0.8, reason, timings)
+
+
+def tree(path: Path) -> dict[str, bytes]:
+    return {str(entry.relative_to(path)): entry.read_bytes() for entry in path.rglob('*') if entry.is_file()}
+
+
+def test_every_frame_is_one_line_that_is_there_at_once(tmp_path: Path) -> None:
+    with RunFolder.create(tmp_path / 'run', CONFIG, NODE) as folder:
+        for index, status in enumerate([Status.INITIALIZED, Status.TRACKED, Status.LOST, Status.TRACKED]):
+            folder.append(frame(index), result(index, status), 0.01)
+            assert len((tmp_path / 'run' / 'trajectory.txt').read_text().splitlines()) == index + 1
+            assert len((tmp_path / 'run' / 'frames.csv').read_text().splitlines()) == index + 2
+    lines = (tmp_path / 'run' / 'trajectory.txt').read_text().splitlines()
+    assert lines[0] == '1000000000.000000000' + ' 0.000000000' * 6 + ' 1.000000000'
+    assert lines[2] == '# lost 1000000000.066666666'
+
+
+def test_what_was_written_is_read_back(tmp_path: Path) -> None:
+    results = [result(0, Status.INITIALIZED), result(1), result(2, Status.LOST), result(3)]
+    with RunFolder.create(tmp_path, CONFIG, OFFLINE) as folder:  # an empty folder may be there
+        for index, entry in enumerate(results):
+            folder.append(frame(index), entry, 0.25, 0.5 if index else 0.125)
+    run = read_run(tmp_path)
+    assert (run.config, run.description, run.camera) == (CONFIG, OFFLINE, CAMERA)
+    assert run.trajectory.stamps_ns.tolist() == [results[index].stamp_ns for index in (0, 1, 3)]
+    for index, pose in zip((0, 1, 3), run.trajectory.T_world_cam):
+        np.testing.assert_allclose(pose, results[index].T_world_cam, atol=3e-9)  # nine decimals
+    assert run.lost_ns == (results[2].stamp_ns,)
+    assert [record.status for record in run.frames] == [entry.status for entry in results]
+    assert [record.is_keyframe for record in run.frames] == [True, False, True, False]
+    assert run.frames[2].reason == results[2].reason
+    assert (run.frames[0].process_ms, run.frames[0].decode_ms) == (250, 125)
+    assert run.frames[1].timings == results[1].timings
+
+
+def test_run_json_says_what_ran_where(tmp_path: Path) -> None:
+    RunFolder.create(tmp_path, CONFIG, OFFLINE).close()
+    information = json.loads((tmp_path / 'run.json').read_text())
+    assert information['program'] == 'splatam run' and information['source']['path'] == '/data/room'
+    assert information['camera'] is None  # no frame yet
+    assert {'system', 'processor', 'cores', 'memory_mb'} == information['machine'].keys()
+    assert information['versions']['torch'] and information['versions']['python']
+    assert information['commit'] == environment.commit()
+    assert re.fullmatch(r'\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00', information['started'])
+
+
+def test_commit_is_the_repository_s_or_unknown() -> None:
+    root = Path(__file__).resolve().parents[2]
+    git = subprocess.run(['git', '-C', root, 'rev-parse', 'HEAD'], capture_output=True, text=True)
+    tracked = subprocess.run(
+        ['git', '-C', root, 'ls-files', '--error-unmatch', environment.__file__], capture_output=True
+    )
+    expected = git.stdout.strip() if git.returncode == tracked.returncode == 0 else None
+    commit = environment.commit()
+    assert (None if commit is None else commit.removesuffix('-dirty')) == expected
+
+
+def test_finish_saves_map_and_metrics(tmp_path: Path) -> None:
+    slam = Slam(CONFIG)
+    folder = RunFolder.create(tmp_path, CONFIG, NODE)
+    folder.append(frame(0), slam.process(frame(0)), 0.5)
+    early = folder.save(slam)  # as the node's save service does
+    assert early.frames == 1 and (tmp_path / 'map.ply').exists()
+    folder.append(frame(1), slam.process(frame(1)), 0.5)
+    metrics = folder.finish(slam)
+    assert len(read_ply(tmp_path / 'map.ply').means) == slam.num_gaussians == metrics.num_gaussians > 0
+    assert Metrics.from_json((tmp_path / 'metrics.json').read_text()) == metrics == read_run(tmp_path).metrics()
+    assert (metrics.frames, metrics.tracked, metrics.fps, metrics.fps_with_io) == (2, 2, 2.0, None)
+    written = json.loads((tmp_path / 'metrics.json').read_text())
+    assert {name: written[name] for name in ('ate_rmse_m', 'psnr_db', 'ssim', 'depth_l1_m', 'psnr_full_db')} == dict.fromkeys(
+        ('ate_rmse_m', 'psnr_db', 'ssim', 'depth_l1_m', 'psnr_full_db')
+    )
+    assert 10 < metrics.peak_rss_mb < 100_000
+    with pytest.raises(ValueError, match='closed'):
+        folder.append(frame(2), result(2), 0.1)
+
+
+def test_a_run_without_frames_is_saved_too(tmp_path: Path) -> None:
+    metrics = RunFolder.create(tmp_path, CONFIG, NODE).finish(Slam(CONFIG))
+    assert (metrics.frames, metrics.tracked, metrics.fps, metrics.timings_ms) == (0, 0, None, {})
+    run = read_run(tmp_path)
+    assert len(run.trajectory) == 0 and run.camera is None and run.metrics() == metrics
+
+
+def test_metrics_by_hand(tmp_path: Path) -> None:
+    with RunFolder.create(tmp_path, CONFIG, OFFLINE) as folder:
+        for index in range(5):
+            status = Status.LOST if index == 3 else Status.TRACKED
+            folder.append(frame(index), result(index, status, total_ms=10.0 * (index + 1)), 0.2, 0.05)
+    metrics = run_metrics(read_run(tmp_path).frames, None, None)
+    assert (metrics.frames, metrics.tracked, metrics.lost) == (5, 4, 1)
+    assert (metrics.fps, metrics.fps_with_io) == (5.0, 4.0)  # 5 / 1 s, 5 / 1.25 s
+    # 10 20 30 40 50: the middle one, and 95 % of the way along their four steps.
+    assert metrics.timings_ms['total'] == StageStatistics(median=30.0, p95=48.0)
+    assert metrics.timings_ms['track'] == StageStatistics(median=18.0, p95=28.8)
+
+
+def test_damaged_metrics_are_one_line(tmp_path: Path) -> None:
+    RunFolder.create(tmp_path, CONFIG, NODE).finish(Slam(CONFIG))
+    for text in ('{', '[]', '{}', '{"frames": 1}', '{"timings_ms": {"track": 3}}'):
+        (tmp_path / 'metrics.json').write_text(text)
+        with pytest.raises(RunFolderError, match=r'metrics\.json cannot be read'):
+            read_run(tmp_path).metrics()
+
+
+def test_existing_results_stay(tmp_path: Path) -> None:
+    RunFolder.create(tmp_path, CONFIG, NODE).close()
+    before = tree(tmp_path)
+    with pytest.raises(RunFolderError, match='exists: choose another folder, or pass --overwrite'):
+        RunFolder.create(tmp_path, CONFIG, OFFLINE)
+    assert tree(tmp_path) == before
+
+
+def test_overwrite_removes_a_run_and_nothing_else(tmp_path: Path) -> None:
+    run = tmp_path / 'run'
+    with RunFolder.create(run, CONFIG, NODE) as folder:
+        folder.append(frame(0), result(0), 0.1)
+    (run / 'checkpoints').mkdir()
+    (run / 'checkpoints' / '1').touch()
+    RunFolder.create(run, CONFIG, OFFLINE, overwrite=True).close()
+    assert read_run(run).description == OFFLINE and len(read_run(run).trajectory) == 0
+    assert not (run / 'checkpoints').exists()
+
+    (run / 'thesis.tex').write_text('years of work')
+    before = tree(run)
+    with pytest.raises(RunFolderError, match=r'more than a run \(thesis\.tex\)'):
+        RunFolder.create(run, CONFIG, NODE, overwrite=True)
+    assert tree(run) == before
+
+
+@pytest.mark.parametrize('overwrite', [False, True])
+def test_other_folders_and_files_stay(tmp_path: Path, overwrite: bool) -> None:
+    (tmp_path / 'photos').mkdir()
+    (tmp_path / 'photos' / 'cat.jpg').write_bytes(b'meow')
+    (tmp_path / 'file').write_bytes(b'text')
+    before = tree(tmp_path)
+    for name in ('photos', 'file', 'file/below'):
+        with pytest.raises(RunFolderError, match='choose another folder'):
+            RunFolder.create(tmp_path / name, CONFIG, NODE, overwrite=overwrite)
+    assert tree(tmp_path) == before
+
+
+def test_no_run_folder_and_damaged_ones_are_one_line(tmp_path: Path) -> None:
+    with pytest.raises(RunFolderError, match='is no run folder: it has no trajectory.txt, config.yaml, run.json'):
+        read_run(tmp_path)
+    RunFolder.create(tmp_path, CONFIG, NODE).close()
+    for name, text in (
+        ('run.json', '{'), ('run.json', '{}'), ('config.yaml', 'tracking: {iteratons: 3}'),
+        ('trajectory.txt', '# lost soon'), ('trajectory.txt', '1 2 3'), ('frames.csv', 'stamp\n1\n'),
+    ):  # fmt: skip
+        good = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_text(text)
+        with pytest.raises(RunFolderError, match='cannot be read') as caught:
+            read_run(tmp_path)
+        assert '\n' not in str(caught.value)
+        (tmp_path / name).write_bytes(good)
+    read_run(tmp_path)
+
+
+def test_kill_loses_nothing_written(tmp_path: Path) -> None:
+    script = """
+        import os, signal, sys
+        from pathlib import Path
+        from test_run_folder import CONFIG, NODE, RunFolder, frame, result
+        folder = RunFolder.create(Path(sys.argv[1]), CONFIG, NODE)
+        for index in range(7):
+            folder.append(frame(index), result(index), 0.1)
+        os.kill(os.getpid(), signal.SIGKILL)
+    """
+    path = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[2])])
+    done = subprocess.run(
+        [sys.executable, '-c', textwrap.dedent(script), str(tmp_path / 'run')], env=os.environ | {'PYTHONPATH': path}
+    )
+    assert done.returncode == -signal.SIGKILL
+    run = read_run(tmp_path / 'run')
+    assert len(run.trajectory) == len(run.frames) == run.metrics().frames == 7
+    assert run.metrics().num_gaussians is None
