@@ -1,0 +1,195 @@
+"""Runs Slam on a thread of its own, fed through a bounded queue. The core's only thread."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+from splatam_core.errors import FrameError
+from splatam_core.types import FrameResult, RgbdFrame
+
+if TYPE_CHECKING:
+    from splatam_core.slam import Slam
+
+T = TypeVar('T')
+WhenFull = Literal['drop_oldest', 'block']
+
+
+class WorkerStopped(RuntimeError):
+    """A frame was submitted to a worker that takes none any more; its cause is what stopped it."""
+
+
+class SlamWorker:
+    """Owns a Slam: whatever touches it runs on the worker's thread, until ``stop`` has returned.
+
+    Frames wait in a bounded queue and are processed in the order they were submitted. When the
+    queue is full a live camera wants ``drop_oldest``, a recording wants ``block``.
+
+    An exception that is no FrameError stops the worker: frames that wait are let go, ``submit``
+    raises WorkerStopped, and ``stop`` raises the exception itself.
+    """
+
+    def __init__(
+        self,
+        slam: Slam,
+        on_result: Callable[[RgbdFrame, FrameResult], None],
+        on_bad_frame: Callable[[RgbdFrame, FrameError], None],
+        *,
+        queue_size: int,
+        when_full: WhenFull,
+    ) -> None:
+        """Start the thread.
+
+        Args:
+            slam: handed over; the caller must not touch it before ``stop`` has returned.
+            on_result: called on the worker's thread after each frame; may use the Slam.
+            on_bad_frame: called on the worker's thread with each frame that Slam refused.
+            queue_size: frames that may wait, besides the one being processed.
+            when_full: what ``submit`` does when that many wait.
+
+        Raises:
+            ValueError: queue_size below 1, or an unknown when_full.
+        """
+        if queue_size < 1:
+            raise ValueError(f'queue_size = {queue_size}: expected at least 1')
+        if when_full not in ('drop_oldest', 'block'):
+            raise ValueError(f"when_full = '{when_full}': expected drop_oldest or block")
+        self._slam = slam
+        self._on_result = on_result
+        self._on_bad_frame = on_bad_frame
+        self._queue_size = queue_size
+        self._when_full = when_full
+        self._frames: deque[RgbdFrame] = deque()
+        self._tasks: deque[tuple[Future[Any], Callable[[Slam], Any]]] = deque()
+        self._busy = False
+        self._dropped = 0
+        self._stopping = False
+        self._error: Exception | None = None
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name='slam')
+        self._thread.start()
+
+    @property
+    def error(self) -> Exception | None:
+        """What stopped the worker, if something went wrong."""
+        with self._changed:
+            return self._error
+
+    @property
+    def dropped(self) -> int:
+        """Frames let go because the queue was full."""
+        with self._changed:
+            return self._dropped
+
+    @property
+    def pending(self) -> int:
+        """Frames not done yet: those that wait and the one being processed."""
+        with self._changed:
+            return len(self._frames) + self._busy
+
+    def submit(self, frame: RgbdFrame) -> None:
+        """Queue a frame; with a full queue drop the oldest or wait for room, as configured.
+
+        Raises:
+            WorkerStopped: the worker is stopping, or an exception has stopped it.
+        """
+        with self._changed:
+            if self._when_full == 'block':
+                self._changed.wait_for(lambda: self._stopping or len(self._frames) < self._queue_size)
+            if self._stopping:
+                raise WorkerStopped('the SLAM worker is stopped and takes no frames') from self._error
+            if len(self._frames) == self._queue_size:
+                self._frames.popleft()
+                self._dropped += 1
+            self._frames.append(frame)
+            self._changed.notify_all()
+
+    def call(self, function: Callable[[Slam], T]) -> Future[T]:
+        """Run a function on the worker's thread, between two frames and ahead of those that wait.
+
+        The future is cancelled when the worker stops before the function has started.
+        """
+        future: Future[T] = Future()
+        with self._changed:
+            if self._stopping:
+                future.cancel()
+            else:
+                self._tasks.append((future, function))
+                self._changed.notify_all()
+        return future
+
+    def stop(self, drain: bool) -> None:
+        """End the thread and wait for it.
+
+        Args:
+            drain: process the frames that wait first; else let them go.
+
+        Raises:
+            Exception: what stopped the worker, if something went wrong.
+        """
+        with self._changed:
+            self._stopping = True
+            if not drain:
+                self._frames.clear()
+            self._changed.notify_all()
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+
+    def _run(self) -> None:
+        try:
+            while (job := self._next()) is not None:
+                job()
+                self._done()
+        except Exception as error:  # whatever it is, it surfaces in stop()
+            self._fail(error)
+
+    def _next(self) -> Callable[[], None] | None:
+        """Wait for something to do; None when all is done and the worker is stopping."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._tasks or self._frames or self._stopping)
+            if self._tasks:
+                future, function = self._tasks.popleft()
+                return lambda: self._fulfil(future, function)
+            if not self._frames:
+                return None
+            frame = self._frames.popleft()
+            self._busy = True
+            self._changed.notify_all()
+            return lambda: self._process(frame)
+
+    def _process(self, frame: RgbdFrame) -> None:
+        try:
+            result = self._slam.process(frame)
+        except FrameError as error:
+            self._on_bad_frame(frame, error)
+        else:
+            self._on_result(frame, result)
+
+    def _fulfil(self, future: Future[T], function: Callable[[Slam], T]) -> None:
+        if not future.set_running_or_notify_cancel():
+            return
+        try:
+            future.set_result(function(self._slam))
+        except Exception as error:  # the caller's function, the caller's exception
+            future.set_exception(error)
+
+    def _done(self) -> None:
+        with self._changed:
+            self._busy = False
+            self._changed.notify_all()
+
+    def _fail(self, error: Exception) -> None:
+        with self._changed:
+            self._error = error
+            self._stopping = True
+            self._busy = False
+            self._frames.clear()
+            futures = [future for future, _ in self._tasks]
+            self._tasks.clear()
+            self._changed.notify_all()
+        for future in futures:
+            future.cancel()

@@ -1,0 +1,219 @@
+"""SlamWorker: order, full queues, bad frames, crashes and shutdown, with a Slam we can hold still."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from splatam_core.camera import PinholeCamera
+from splatam_core.errors import FrameError
+from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status
+from splatam_core.worker import SlamWorker, WorkerStopped
+
+CAMERA = PinholeCamera(4, 3, 4.0, 4.0, 1.5, 1.0)
+TIMEOUT_S = 10.0  # only ever waited out when the test fails
+
+
+def frame(stamp_ns: int) -> RgbdFrame:
+    return RgbdFrame(stamp_ns, np.zeros((3, 4, 3), np.uint8), np.ones((3, 4), np.float32), CAMERA)
+
+
+class HeldSlam:
+    """Processes one frame for each ``release``; refuses stamp 13, breaks at stamp 99."""
+
+    def __init__(self, held: bool = True) -> None:
+        self.gate = threading.Semaphore(0 if held else 10_000)
+        self.started = threading.Semaphore(0)
+        self.threads: set[threading.Thread] = set()
+
+    def release(self, frames: int) -> None:
+        self.gate.release(frames)
+
+    def wait_started(self) -> None:
+        assert self.started.acquire(timeout=TIMEOUT_S)
+
+    def process(self, frame: RgbdFrame) -> FrameResult:
+        self.threads.add(threading.current_thread())
+        self.started.release()
+        assert self.gate.acquire(timeout=TIMEOUT_S)
+        if frame.stamp_ns == 13:
+            raise FrameError('unlucky')
+        if frame.stamp_ns == 99:
+            raise ZeroDivisionError('broken')
+        return FrameResult(0, frame.stamp_ns, Status.TRACKED, np.eye(4), False, 0, 1.0, 1.0, '', StageTimings())
+
+
+class Recorder:
+    """What a worker reported."""
+
+    def __init__(self) -> None:
+        self.results: list[int] = []
+        self.bad: list[tuple[int, str]] = []
+
+    def on_result(self, frame: RgbdFrame, result: FrameResult) -> None:
+        assert frame.stamp_ns == result.stamp_ns
+        self.results.append(result.stamp_ns)
+
+    def on_bad_frame(self, frame: RgbdFrame, error: FrameError) -> None:
+        self.bad.append((frame.stamp_ns, str(error)))
+
+
+def start(slam: HeldSlam, queue_size: int = 2, when_full: str = 'block') -> tuple[SlamWorker, Recorder]:
+    recorder = Recorder()
+    worker = SlamWorker(
+        slam, recorder.on_result, recorder.on_bad_frame, queue_size=queue_size, when_full=when_full
+    )  # fmt: skip
+    return worker, recorder
+
+
+def submit_in_thread(worker: SlamWorker, stamp_ns: int) -> tuple[threading.Thread, list[BaseException]]:
+    raised: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            worker.submit(frame(stamp_ns))
+        except WorkerStopped as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    return thread, raised
+
+
+def test_processes_in_order_on_one_thread_that_is_not_the_callers() -> None:
+    slam = HeldSlam(held=False)
+    worker, recorder = start(slam)
+    for stamp_ns in range(1, 8):
+        worker.submit(frame(stamp_ns))
+    worker.stop(drain=True)
+    assert recorder.results == [1, 2, 3, 4, 5, 6, 7]
+    assert len(slam.threads) == 1 and threading.current_thread() not in slam.threads
+    assert worker.pending == 0 and worker.dropped == 0 and worker.error is None
+
+
+def test_drop_oldest_keeps_the_newest_and_counts() -> None:
+    slam = HeldSlam()
+    worker, recorder = start(slam, queue_size=2, when_full='drop_oldest')
+    worker.submit(frame(1))
+    slam.wait_started()
+    for stamp_ns in (2, 3, 4, 5):
+        worker.submit(frame(stamp_ns))
+    assert worker.dropped == 2 and worker.pending == 3
+    slam.release(3)
+    worker.stop(drain=True)
+    assert recorder.results == [1, 4, 5]
+
+
+def test_block_waits_for_room_and_loses_nothing() -> None:
+    slam = HeldSlam()
+    worker, recorder = start(slam, queue_size=1, when_full='block')
+    worker.submit(frame(1))
+    slam.wait_started()
+    worker.submit(frame(2))
+    thread, _ = submit_in_thread(worker, 3)
+    thread.join(0.1)
+    assert thread.is_alive() and worker.pending == 2
+    slam.release(3)
+    thread.join(TIMEOUT_S)
+    assert not thread.is_alive()
+    worker.stop(drain=True)
+    assert recorder.results == [1, 2, 3] and worker.dropped == 0
+
+
+def test_stop_without_drain_lets_waiting_frames_go_but_finishes_the_current_one() -> None:
+    slam = HeldSlam()
+    worker, recorder = start(slam, queue_size=5)
+    for stamp_ns in (1, 2, 3):
+        worker.submit(frame(stamp_ns))
+    slam.wait_started()
+    stopper = threading.Thread(target=worker.stop, kwargs={'drain': False})
+    stopper.start()
+    while worker.pending > 1:  # until stop() has cleared the queue
+        stopper.join(0.01)
+    slam.release(1)
+    stopper.join(TIMEOUT_S)
+    assert not stopper.is_alive()
+    assert recorder.results == [1]
+
+
+def test_bad_frames_are_reported_and_the_next_one_is_processed() -> None:
+    worker, recorder = start(HeldSlam(held=False))
+    for stamp_ns in (12, 13, 14):
+        worker.submit(frame(stamp_ns))
+    worker.stop(drain=True)
+    assert recorder.results == [12, 14]
+    assert recorder.bad == [(13, 'unlucky')]
+
+
+def test_a_crash_stops_intake_and_surfaces_in_stop() -> None:
+    slam = HeldSlam()
+    worker, recorder = start(slam, queue_size=1)
+    worker.submit(frame(99))
+    slam.wait_started()
+    worker.submit(frame(100))
+    thread, raised = submit_in_thread(worker, 101)  # waits for room that will never be
+    slam.release(1)
+    thread.join(TIMEOUT_S)
+    assert isinstance(raised[0].__cause__, ZeroDivisionError)
+    with pytest.raises(WorkerStopped):
+        worker.submit(frame(102))
+    assert isinstance(worker.error, ZeroDivisionError) and worker.pending == 0
+    with pytest.raises(ZeroDivisionError, match='broken'):
+        worker.stop(drain=True)
+    assert recorder.results == []
+
+
+def test_an_exception_in_on_result_stops_the_worker_too() -> None:
+    def disk_full(frame: RgbdFrame, result: FrameResult) -> None:
+        raise OSError('no space left')
+
+    worker = SlamWorker(HeldSlam(held=False), disk_full, lambda *_: None, queue_size=1, when_full='block')
+    worker.submit(frame(1))
+    with pytest.raises(OSError, match='no space'):
+        worker.stop(drain=True)
+
+
+def test_calls_run_between_frames_ahead_of_those_that_wait() -> None:
+    slam = HeldSlam()
+    worker, recorder = start(slam, queue_size=3)
+    worker.submit(frame(1))
+    slam.wait_started()
+    worker.submit(frame(2))
+    future = worker.call(lambda owned: (owned, threading.current_thread(), list(recorder.results)))
+    slam.release(2)
+    owned, thread, done_before = future.result(TIMEOUT_S)
+    assert owned is slam and thread in slam.threads and done_before == [1]
+    worker.stop(drain=True)
+    assert recorder.results == [1, 2]
+
+
+def test_a_failing_call_hands_its_exception_to_the_caller_and_harms_nothing() -> None:
+    worker, recorder = start(HeldSlam(held=False))
+    future = worker.call(lambda slam: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        future.result(TIMEOUT_S)
+    worker.submit(frame(1))
+    worker.stop(drain=True)
+    assert recorder.results == [1]
+
+
+def test_calls_to_a_stopped_or_crashed_worker_are_cancelled() -> None:
+    slam = HeldSlam()
+    worker, _ = start(slam)
+    worker.submit(frame(99))
+    slam.wait_started()
+    waiting = worker.call(lambda owned: None)
+    # The crash comes first: the call waits behind the frame being processed.
+    slam.release(1)
+    with pytest.raises(ZeroDivisionError):
+        worker.stop(drain=False)
+    assert waiting.cancelled()
+    assert worker.call(lambda owned: None).cancelled()
+
+
+@pytest.mark.parametrize(('queue_size', 'when_full'), [(0, 'block'), (1, 'drop_newest')])
+def test_refuses_senseless_arguments(queue_size: int, when_full: str) -> None:
+    with pytest.raises(ValueError, match='expected'):
+        SlamWorker(HeldSlam(), print, print, queue_size=queue_size, when_full=when_full)
