@@ -1,0 +1,220 @@
+"""Every backend against the reference, the reference against finite differences and hand-worked cases."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import rasterizer_scenes as scenes
+import torch
+from rasterizer_scenes import Scene
+
+from splatam_core.errors import RasterizerError
+from splatam_core.rasterizer import Gaussians, Rasterizer, make_rasterizer
+from splatam_core.rasterizer.base import MAX_ALPHA, MIN_ALPHA
+from splatam_core.rasterizer.reference import ReferenceRasterizer
+
+BACKENDS = [('cpu', 1), ('cpu', 2), ('cpu', 3)]
+
+# float32 against float64: 24 bits through a sum of some hundred terms, in units of the largest value.
+IMAGE_TOLERANCE = 1e-5
+GRADIENT_TOLERANCE = 5e-5
+
+
+def _behind(seed: int) -> Scene:
+    scene = scenes.random_scene(seed, 200, 40, 30)
+    means = scene.gaussians.means.clone()
+    means[::2, 2] -= 3.0
+    return Scene(
+        Gaussians(means, scene.gaussians.log_scales, scene.gaussians.logit_opacities, scene.gaussians.rgb),
+        scene.camera, scene.T_cam_world,
+    )  # fmt: skip
+
+
+def _none() -> Scene:
+    return scenes.random_scene(0, 0, 21, 13)
+
+
+SCENES = {
+    'random': scenes.random_scene(1, 300, 64, 48),
+    'odd size': scenes.random_scene(2, 300, 61, 45),
+    'smaller than a tile': scenes.random_scene(3, 40, 5, 3),
+    'one pixel': scenes.random_scene(3, 40, 1, 1),
+    'many, deep': scenes.random_scene(4, 3000, 33, 25),
+    'behind the camera': _behind(5),
+    'empty': _none(),
+    'huge': scenes.random_scene(6, 60, 50, 37, sigma_px=60.0),
+    'tiny': scenes.random_scene(7, 400, 50, 37, sigma_px=0.01),
+    'opaque': scenes.random_scene(8, 300, 50, 37, logit=6.0),
+    'faint': scenes.random_scene(9, 300, 50, 37, logit=-5.0),
+    'at the left border': scenes.one((-0.59 * 2, 0.0, 2.0), 0.05, 0.7, scenes.camera(40, 30)),
+    'at the near plane': scenes.one((0.0, 0.0, 0.2000001), 0.01, 0.7, scenes.camera(40, 30)),
+}
+
+
+@pytest.mark.parametrize('name', SCENES)
+@pytest.mark.parametrize(('backend', 'threads'), BACKENDS)
+def test_backend_equals_reference(name: str, backend: str, threads: int) -> None:
+    """Image and every gradient, map and pose."""
+    _assert_equals_reference(make_rasterizer(backend, threads), SCENES[name])
+
+
+def _assert_equals_reference(rasterizer: Rasterizer, scene: Scene) -> None:
+    clear = scenes.clear_pixels(scene)
+    assert clear.float().mean() > 0.9
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.randn(5, scene.camera.height, scene.camera.width, generator=generator) * clear
+    expected, expected_gradients = scenes.render_with_gradients(ReferenceRasterizer(), scene, torch.float64, weights)
+    actual, gradients = scenes.render_with_gradients(rasterizer, scene, torch.float32, weights)
+    assert _relative_error(actual * clear, expected * clear) < IMAGE_TOLERANCE
+    for parameter, gradient in expected_gradients.items():
+        assert _relative_error(gradients[parameter], gradient) < GRADIENT_TOLERANCE, parameter
+
+
+@pytest.mark.parametrize('isa', ['generic', 'avx2', 'avx512'])
+def test_every_instruction_set_equals_reference(isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the processor has it: the run-time choice must not change the picture."""
+    monkeypatch.setenv('SPLATAM_ISA', isa)
+    rasterizer = make_rasterizer('cpu', 1)
+    if rasterizer.instruction_set != isa:
+        pytest.skip(f'this processor runs {rasterizer.instruction_set}, not {isa}')
+    _assert_equals_reference(rasterizer, SCENES['odd size'])
+
+
+def test_reference_gradients_equal_finite_differences() -> None:
+    """Central differences in float64, along random directions in all parameters and the pose at once."""
+    scene = scenes.random_scene(11, 25, 16, 12)
+    weights = torch.randn(5, 12, 16, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    _, gradients = scenes.render_with_gradients(ReferenceRasterizer(), scene, torch.float64, weights)
+    generator = torch.Generator().manual_seed(3)
+    for _ in range(5):
+        direction = {
+            name: torch.randn(gradient.shape, generator=generator, dtype=torch.float64)
+            for name, gradient in gradients.items()
+        }
+        slope = sum((direction[name] * gradient).sum() for name, gradient in gradients.items())
+        # 1e-8: no pixel crosses a threshold in so small a step, and float64 still resolves the difference to 1e-6.
+        difference = (_loss(scene, direction, 1e-8, weights) - _loss(scene, direction, -1e-8, weights)) / 2e-8
+        assert difference == pytest.approx(float(slope), rel=1e-5)
+
+
+def _loss(scene: Scene, direction: dict[str, torch.Tensor], step: float, weights: torch.Tensor) -> float:
+    moved = {name: getattr(scene.gaussians, name) + step * direction[name] for name in scenes.PARAMETERS}
+    T = scene.T_cam_world.clone()
+    T[:3] += step * direction['T_cam_world']
+    return float((scenes.images(ReferenceRasterizer().render(Gaussians(**moved), scene.camera, T)) * weights).sum())
+
+
+ALL = [('reference', 1), ('cpu', 2)]
+
+
+def _draw(backend: str, threads: int, scene: Scene) -> torch.Tensor:
+    g = scene.gaussians
+    gaussians = Gaussians(g.means.float(), g.log_scales.float(), g.logit_opacities.float(), g.rgb.float())
+    render = make_rasterizer(backend, threads).render(gaussians, scene.camera, scene.T_cam_world.float())
+    return scenes.images(render)
+
+
+@pytest.mark.parametrize(('backend', 'threads'), ALL)
+def test_one_gaussian_by_hand(backend: str, threads: int) -> None:
+    """Peak at its projection, width and depth from the contract's formulas."""
+    cam = scenes.camera(41, 31)
+    z, sigma_m, opacity = 2.0, 0.1, 0.6
+    x, y = (20 - cam.cx) / cam.fx * z, (15 - cam.cy) / cam.fy * z  # onto the centre of pixel (20, 15)
+    image = _draw(backend, threads, scenes.one((x, y, z), sigma_m, opacity, cam))
+    variance = ((cam.fx + cam.fy) / 2 * sigma_m / z) ** 2 + 0.3
+    assert float(image[4, 15, 20]) == pytest.approx(opacity, rel=1e-5)
+    assert float(image[4, 15, 23]) == pytest.approx(opacity * math.exp(-9 / (2 * variance)), rel=1e-5)
+    assert float(image[3, 15, 20]) == pytest.approx(z * opacity, rel=1e-5)
+    reach = math.sqrt(2 * math.log(opacity / MIN_ALPHA) * variance)
+    touched = torch.nonzero(image[4])
+    assert int((touched - torch.tensor([15, 20])).pow(2).sum(1).max()) <= reach**2
+
+
+@pytest.mark.parametrize(('backend', 'threads'), ALL)
+def test_nearer_gaussian_hides_the_farther(backend: str, threads: int) -> None:
+    """Blended front to back by depth, whatever the order in the map; alpha never above 0.99."""
+    cam = scenes.camera(9, 9)
+    near, far = (scenes.one((0.0, 0.0, z), 30.0, 0.9999, cam).gaussians for z in (1.0, 2.0))
+    both = Gaussians(*(torch.cat([getattr(far, n), getattr(near, n)]) for n in scenes.PARAMETERS))
+    image = _draw(backend, threads, Scene(both, cam, torch.eye(4, dtype=torch.float64)))
+    u, v = round(cam.cx), round(cam.cy)
+    second = (1 - MAX_ALPHA) * MAX_ALPHA
+    assert float(image[4, v, u]) == pytest.approx(MAX_ALPHA + second, rel=1e-4)
+    assert float(image[3, v, u]) == pytest.approx(1.0 * MAX_ALPHA + 2.0 * second, rel=1e-4)
+
+
+@pytest.mark.parametrize(('backend', 'threads'), ALL)
+def test_blending_stops_once_a_pixel_is_opaque(backend: str, threads: int) -> None:
+    """At alpha 0.95 transmittance is 0.05, 2.5e-3, 1.25e-4, 6.25e-6: the fourth layer counts, the fifth does not."""
+    cam = scenes.camera(9, 9)
+    u, v = round(cam.cx), round(cam.cy)
+    silhouettes = []
+    for count in (3, 4, 6):
+        layers = [scenes.one((0.0, 0.0, 1 + 0.1 * k), 30.0, 0.95, cam).gaussians for k in range(count)]
+        stack = Gaussians(*(torch.cat([getattr(g, n) for g in layers]) for n in scenes.PARAMETERS))
+        image = _draw(backend, threads, Scene(stack, cam, torch.eye(4, dtype=torch.float64)))
+        silhouettes.append(float(image[4, v, u]))
+    assert silhouettes[0] < silhouettes[1] == silhouettes[2]
+
+
+@pytest.mark.parametrize(('backend', 'threads'), ALL)
+def test_gaussians_nearer_than_the_near_plane_are_not_drawn(backend: str, threads: int) -> None:
+    """z <= 0.2 m, and behind the camera."""
+    for z in (0.19, 0.0, -1.0):
+        assert not _draw(backend, threads, scenes.one((0.0, 0.0, z), 0.1, 0.9, scenes.camera(16, 16))).any()
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf])
+def test_gaussians_that_are_not_finite_spoil_nothing(value: float) -> None:
+    """A broken centre is not drawn; the others are."""
+    scene = scenes.random_scene(12, 50, 32, 24)
+    g = scene.gaussians
+    broken = torch.cat([g.means, torch.full((1, 3), value, dtype=torch.float64)])
+    more = Gaussians(
+        broken, torch.cat([g.log_scales, g.log_scales[:1]]),
+        torch.cat([g.logit_opacities, g.logit_opacities[:1]]), torch.cat([g.rgb, g.rgb[:1]]),
+    )  # fmt: skip
+    torch.testing.assert_close(
+        _draw('cpu', 2, Scene(more, scene.camera, scene.T_cam_world)), _draw('cpu', 2, scene), rtol=0, atol=0
+    )
+
+
+def test_threads_do_not_change_the_image_and_repeats_do_not_change_gradients() -> None:
+    """Bit for bit."""
+    scene = SCENES['many, deep']
+    weights = torch.randn(5, 25, 33, generator=torch.Generator().manual_seed(4))
+    runs = [
+        scenes.render_with_gradients(make_rasterizer('cpu', threads), scene, torch.float32, weights)
+        for threads in (1, 2, 2, 5)
+    ]
+    for image, _ in runs[1:]:
+        assert torch.equal(image, runs[0][0])
+    for name, gradient in runs[1][1].items():
+        assert torch.equal(gradient, runs[2][1][name])
+
+
+def test_two_renders_before_their_backwards() -> None:
+    """What one forward pass keeps for its backward pass survives another forward pass."""
+    first, second = scenes.random_scene(20, 100, 32, 24), scenes.random_scene(21, 200, 40, 30)
+    rasterizer = make_rasterizer('cpu', 2)
+    leaves = [getattr(first.gaussians, n).float().requires_grad_() for n in scenes.PARAMETERS]
+    image = scenes.images(rasterizer.render(Gaussians(*leaves), first.camera, first.T_cam_world.float()))
+    scenes.render_with_gradients(rasterizer, second, torch.float32, torch.ones(5, 30, 40))
+    image.sum().backward()
+    _, expected = scenes.render_with_gradients(rasterizer, first, torch.float32, torch.ones(5, 24, 32))
+    assert torch.equal(leaves[0].grad, expected['means'])
+
+
+def test_wrong_input_is_refused() -> None:
+    """Before it reaches the kernels."""
+    scene = scenes.random_scene(1, 10, 16, 12)
+    with pytest.raises(RasterizerError, match='float64'):
+        make_rasterizer('cpu', 1).render(scene.gaussians, scene.camera, scene.T_cam_world)
+
+
+def _relative_error(actual: torch.Tensor, expected: torch.Tensor) -> float:
+    if expected.numel() == 0:
+        return float(actual.numel())
+    scale = max(float(expected.abs().max()), 1e-3)
+    return float((actual.double() - expected.double()).abs().max()) / scale
