@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
 
-if sys.version_info < (3, 10):
+if sys.version_info < (3, 10):  # noqa: UP036
     sys.exit(f'splatam_ros: Python {sys.version.split()[0]} is too old: install Python 3.10, 3.11 or 3.12')
 
 NAME = 'splatam_ros'
@@ -26,7 +26,8 @@ SYSTEM_PYBIND11 = Path('/usr/include/pybind11/pybind11.h')
 # No -ffast-math and no -march: NaN must stay NaN, and one build must run on every processor of its kind.
 # No -Wpsabi: it warns that wide vectors cross function calls differently per processor; ours cross none.
 COMPILE_FLAGS = [
-    '-std=c++17', '-O3', '-g0', '-fno-math-errno', '-fno-trapping-math', '-fvisibility=hidden', '-pthread', '-Wno-psabi',
+    '-std=c++17', '-O3', '-g0', '-fno-math-errno', '-fno-trapping-math', '-fvisibility=hidden', '-pthread',
+    '-Wno-psabi',
 ]  # fmt: skip
 
 
@@ -106,7 +107,7 @@ setup(
         'numpy>=1.22',
         'opencv-python-headless>=4.6',
         'pyyaml>=5.4',
-        'rosbags>=0.10',
+        'rosbags>=0.11',
         'torch>=2.2',
         'tqdm>=4.60',
     ],

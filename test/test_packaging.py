@@ -34,9 +34,7 @@ def canonical(requirement: str) -> str:
 def files_below(folder: Path, pattern: str = '*') -> set[Path]:
     """Files by their path relative to the folder, without caches."""
     return {
-        path.relative_to(folder)
-        for path in folder.rglob(pattern)
-        if path.is_file() and '__pycache__' not in path.parts
+        path.relative_to(folder) for path in folder.rglob(pattern) if path.is_file() and '__pycache__' not in path.parts
     }
 
 
