@@ -1,0 +1,68 @@
+"""The configuration: presets, overrides, and errors that help."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from splatam_core.config import SlamConfig, flat_values, load_config, preset_names, settings, to_yaml
+from splatam_core.errors import ConfigError
+
+
+@pytest.mark.parametrize('preset', preset_names())
+def test_every_preset_loads(preset: str) -> None:
+    assert isinstance(load_config(preset), SlamConfig)
+
+
+def test_presets_state_the_papers_numbers() -> None:
+    paper, small, tum = (load_config(name) for name in ('splatam', 'splatam_s', 'tum'))
+    assert (paper.tracking.iterations, paper.mapping.iterations) == (40, 60)
+    assert (small.tracking.iterations, small.mapping.iterations, small.densification.scale) == (10, 15, 0.5)
+    assert (tum.tracking.iterations, tum.mapping.iterations, tum.tracking.rotation_rate) == (200, 30, 2e-3)
+
+
+def test_overrides_win_over_the_preset() -> None:
+    config = load_config('splatam_s', ['tracking.iterations=7', 'mapping.means_rate=1e-3', 'seed=3'])
+    assert (config.tracking.iterations, config.mapping.means_rate, config.seed) == (7, 1e-3, 3)
+    assert config.mapping.iterations == 15
+
+
+def test_yaml_round_trip(tmp_path: Path) -> None:
+    config = load_config('quick', {'depth.max_m': 4, 'tracking.motion_model': 'last_pose'})
+    path = tmp_path / 'config.yaml'
+    path.write_text(to_yaml(config))
+    assert load_config(str(path)) == config
+
+
+@pytest.mark.parametrize(
+    ('override', 'message'),
+    [
+        ('tracking.iteratons=40', "unknown key 'tracking.iteratons'; did you mean 'tracking.iterations'?"),
+        ('tracking=4', "unknown key 'tracking'"),
+        ('tracking.iterations', 'expected key=value'),
+        ('tracking.iterations=many', 'expected a whole number at least 0'),
+        ('tracking.iterations=1.5', 'expected a whole number at least 0'),
+        ('tracking.iterations=-1', 'expected a whole number at least 0'),
+        ('tracking.silhouette_threshold=1.5', 'at least 0 and at most 1'),
+        ('tracking.silhouette_threshold=nan', 'at least 0 and at most 1'),
+        ('rasterizer=cuda', 'one of cpu, reference'),
+        ('depth.min_m=200', 'less than depth.max_m'),
+    ],
+)
+def test_wrong_overrides_say_what_is_right(override: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config('quick', [override])
+    assert message in str(caught.value)
+
+
+def test_unknown_preset_lists_the_known() -> None:
+    with pytest.raises(ConfigError, match='shipped: .*quick.*splatam'):
+        load_config('fast')
+
+
+def test_every_setting_is_documented_and_its_default_allowed() -> None:
+    defaults = flat_values(SlamConfig())
+    for setting in settings():
+        assert setting.help.endswith('.'), setting.name
+        assert setting.check(defaults[setting.name]) == setting.default
