@@ -94,7 +94,8 @@ def run(args: argparse.Namespace) -> int:
     apply_threads(config)
     source = _source(args)
     sequence = _open(source)
-    folder = RunFolder.create(args.out, config, RunDescription('splatam run', args.preset, source), args.overwrite)
+    description = RunDescription('splatam run', args.preset, source)
+    folder = RunFolder.create(args.out, config, description, overwrite=args.overwrite)
     with folder, _StopRequest() as stop:
         slam = Slam(config)
         failure = _process(sequence, slam, folder, stop)
@@ -109,11 +110,18 @@ def run(args: argparse.Namespace) -> int:
     if metrics.frames == 0:
         raise RunFolderError(f'{sequence.name}: not one of its {len(sequence)} frames could be used; see above')
     if not args.no_evaluate:
-        metrics, problems = _score(read_run(args.out), sequence.ground_truth(), sequence, every=1)
-        for problem in problems:
-            _say(f'not scored: {problem}')
+        metrics = _score_own_run(read_run(args.out), sequence)
     _print_summary(metrics, args.out)
     return 0
+
+
+def _score_own_run(run: RunRecord, sequence: FrameSequence) -> Metrics:
+    """Score a run just done; where too little was tracked to compare with the truth, the images only."""
+    try:
+        return _score(run, sequence.ground_truth(), sequence, every=1)
+    except RunFolderError as error:
+        _say(f'no trajectory error: {error}')
+        return _score(run, None, sequence, every=1)
 
 
 class _StopRequest:
@@ -188,11 +196,8 @@ def evaluate(args: argparse.Namespace) -> int:
     if sequence is not None and not (run.path / MAP).is_file():
         _say(f'{run.path} has no {MAP}, the run ended before it was saved: trajectory only')
         sequence = None
-    metrics, problems = _score(run, truth, sequence, args.every)
-    _print_summary(metrics, args.dir)
-    for problem in problems:
-        print(f'splatam: error: {problem}', file=sys.stderr)
-    return EXIT_ERROR if problems else 0
+    _print_summary(_score(run, truth, sequence, args.every), args.dir)
+    return 0
 
 
 def _truth_and_frames(run: RunRecord, given: str | None) -> tuple[Trajectory | None, FrameSequence | None]:
@@ -225,30 +230,19 @@ def _open_own_source(run: RunRecord) -> FrameSequence | None:
         return None
 
 
-def _score(
-    run: RunRecord, truth: Trajectory | None, sequence: FrameSequence | None, every: int
-) -> tuple[Metrics, list[SplatamError]]:
-    """Score, write ``metrics.json`` and ``report.png``. What cannot be scored stays null; returns why beside it."""
+def _score(run: RunRecord, truth: Trajectory | None, sequence: FrameSequence | None, every: int) -> Metrics:
+    """Score, then write ``metrics.json`` and ``report.png``; an error leaves both as they are."""
     from splatam_core.evaluation.report import write_report
-    from splatam_core.evaluation.score import ImageEvaluation, TruthEvaluation, combine, score_images, score_trajectory
+    from splatam_core.evaluation.score import combine, score_images, score_trajectory
     from splatam_core.files import replace_text
     from splatam_core.run_folder import METRICS, REPORT
 
-    against_truth: TruthEvaluation | None = None
-    against_images: ImageEvaluation | None = None
-    problems: list[SplatamError] = []
-    try:
-        against_truth = None if truth is None else score_trajectory(run, truth)
-    except SplatamError as error:
-        problems.append(error)
-    try:
-        against_images = None if sequence is None else score_images(run, sequence, every, _score_progress)
-    except SplatamError as error:
-        problems.append(error)
+    against_truth = None if truth is None else score_trajectory(run, truth)
+    against_images = None if sequence is None else score_images(run, sequence, every, _score_progress)
     evaluation = combine(run, against_truth, against_images)
     replace_text(run.path / METRICS, evaluation.metrics.to_json())
     write_report(evaluation, run.path / REPORT)
-    return evaluation.metrics, problems
+    return evaluation.metrics
 
 
 def _score_progress(indices: range) -> Iterable[int]:

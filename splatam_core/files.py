@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,9 +17,17 @@ def replaced(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f'.{path.name}.{os.getpid()}')
     try:
         yield temporary
+        with temporary.open('rb') as file:
+            os.fsync(file.fileno())  # else a power cut may leave the new name with nothing behind it
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def is_unfinished(name: str, replaceable: Collection[str]) -> bool:
+    """Whether a file's name is one that ``replaced`` left when its process was killed."""
+    stem, _, process = name.removeprefix('.').rpartition('.')
+    return name.startswith('.') and process.isdecimal() and stem in replaceable
 
 
 def replace_text(path: Path, text: str) -> None:

@@ -32,7 +32,7 @@ PROPERTIES = ('x', 'y', 'z', *NORMALS, 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', 
 COMMENTS = (
     'Gaussian map of splatam_ros',
     'world = first camera, optical axes: x right, y down, z forward; metres',
-    'a pixel\'s centre is its integer index: u = fx x/z + cx',
+    "a pixel's centre is its integer index: u = fx x/z + cx",
 )
 
 _SCALAR_TYPES = {
@@ -66,7 +66,7 @@ def _columns(gaussians: Gaussians) -> dict[str, NDArray[np.float64]]:
     columns = dict(zip('xyz', means.T))
     columns |= {f'f_dc_{c}': (rgb[:, c] - 0.5) / SH_C0 for c in range(3)}
     columns |= {'opacity': logits, 'rot_0': np.ones(len(means))}
-    return columns | {name: log_scales[:, 0] for name in SCALES}
+    return columns | dict.fromkeys(SCALES, log_scales[:, 0])
 
 
 def read_ply(path: Path) -> Gaussians:
@@ -117,8 +117,9 @@ def _read_header(file: BinaryIO) -> _Header:
 
 
 def _parse_header(lines: list[list[str]]) -> _Header:
-    if lines[:1] != [['format', 'binary_little_endian', '1.0']]:
-        raise ValueError(f"format is '{' '.join(lines[0][1:]) if lines else ''}'; only binary_little_endian 1.0 is read")
+    kind = ' '.join(lines[0]) if lines else ''
+    if kind != 'format binary_little_endian 1.0':
+        raise ValueError(f"'{kind}': only format binary_little_endian 1.0 is read")
     if len(lines) < 2 or lines[1][:2] != ['element', 'vertex'] or len(lines[1]) != 3:
         raise ValueError("the first element must be 'vertex', one per Gaussian")
     if not lines[1][2].isdecimal():
@@ -150,7 +151,7 @@ def _check_values(path: Path, values: dict[str, NDArray[np.float32]]) -> None:
         raise MapFileError(f'{path}: {int((~finite).sum())} of {len(finite)} Gaussians hold NaN or infinity')
     first, *others = (values[name] for name in SCALES)
     if any((first != other).any() for other in others):
-        raise MapFileError(f'{path}: the Gaussians are not isotropic (scale_0, scale_1, scale_2 differ); only such are read')
+        raise MapFileError(f'{path}: scale_0, scale_1 and scale_2 differ: only isotropic Gaussians are read')
 
 
 def _tensor(values: dict[str, NDArray[np.float32]], names: tuple[str, ...]) -> torch.Tensor:

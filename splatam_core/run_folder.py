@@ -28,7 +28,7 @@ from splatam_core.camera import PinholeCamera
 from splatam_core.config import SlamConfig, load_config, to_yaml
 from splatam_core.errors import RunFolderError, SplatamError
 from splatam_core.evaluation.metrics import STAGES, Metrics, stage_statistics
-from splatam_core.files import replace_text
+from splatam_core.files import is_unfinished, replace_text
 from splatam_core.ply import write_ply
 from splatam_core.trajectory import pose_line, read_trajectory, stamp_from_text, stamp_text
 from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status, Trajectory
@@ -302,13 +302,17 @@ def _remove_run(path: Path) -> None:
     """Remove a run's files, and nothing that no run wrote."""
     if not (path / RUN).is_file():
         raise RunFolderError(f'{path} holds no run ({RUN} is missing), so it is not overwritten: choose another folder')
-    others = sorted(entry.name for entry in path.iterdir() if entry.name not in (*FILES, CHECKPOINTS))
+    others = sorted(entry.name for entry in path.iterdir() if not _is_of_a_run(entry.name))
     if others:
         raise RunFolderError(
             f'{path} holds more than a run ({", ".join(others[:5])}), so it is not overwritten: '
             'move that away or choose another folder'
         )
     shutil.rmtree(path)
+
+
+def _is_of_a_run(name: str) -> bool:
+    return name in FILES or name == CHECKPOINTS or is_unfinished(name, FILES)
 
 
 def _run_information(description: RunDescription) -> dict[str, Any]:

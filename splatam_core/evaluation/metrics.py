@@ -88,6 +88,4 @@ def stage_statistics(timings: Sequence[StageTimings]) -> dict[str, StageStatisti
         return {}
     table = np.array([[getattr(frame, stage) for stage in STAGES] for frame in timings])  # [frames, stages]
     median, p95 = np.percentile(table, [50, 95], axis=0)
-    return {
-        stage: StageStatistics(round(float(m), 3), round(float(p), 3)) for stage, m, p in zip(STAGES, median, p95)
-    }
+    return {stage: StageStatistics(round(float(m), 3), round(float(p), 3)) for stage, m, p in zip(STAGES, median, p95)}

@@ -12,7 +12,8 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from splatam_core.evaluation.metrics import STAGES
-from splatam_core.evaluation.score import Evaluation, Sample
+from splatam_core.evaluation.score import Evaluation, Sample, TruthEvaluation
+from splatam_core.evaluation.trajectory import TrajectoryError
 from splatam_core.types import Status
 
 INK, MUTED, FAINT = '#1b1f24', '#6b7480', '#e3e6ea'
@@ -35,11 +36,12 @@ def seconds(evaluation: Evaluation, stamps_ns: NDArray[np.int64]) -> NDArray[np.
 
 def top_view(ax: Axes, evaluation: Evaluation) -> LineCollection | None:
     """The path from above: x right, z forward. Returns the error-coloured line where a truth is known."""
-    if evaluation.truth is not None:
-        _line(ax, _truth_in_span(evaluation)[:, [0, 2]], TRUTH, 1.6, 'truth')
     centres = evaluation.run.trajectory.T_world_cam[:, :3, 3]
-    colored = _error_line(ax, evaluation) if evaluation.truth is not None else None
-    if colored is None:
+    colored = None
+    if evaluation.truth is not None:
+        _line(ax, _truth_in_span(evaluation, evaluation.truth)[1][:, [0, 2]], TRUTH, 1.6, 'truth')
+        colored = _error_line(ax, evaluation, evaluation.truth.error)
+    else:
         _line(ax, centres[:, [0, 2]], ESTIMATE, 1.8, 'estimate')
     if len(centres):
         ax.plot(*centres[0, [0, 2]], 'o', ms=7, mfc='white', mec=INK, mew=1.4, label='start', zorder=4)
@@ -51,8 +53,7 @@ def top_view(ax: Axes, evaluation: Evaluation) -> LineCollection | None:
     return colored
 
 
-def _error_line(ax: Axes, evaluation: Evaluation) -> LineCollection:
-    error = evaluation.truth.error
+def _error_line(ax: Axes, evaluation: Evaluation, error: TrajectoryError) -> LineCollection:
     points = error.estimate_m[:, [0, 2]]
     connected = _connected(evaluation, error.stamps_ns)
     pieces = np.stack([points[:-1], points[1:]], axis=1)[connected]  # [K, 2, 2]
@@ -69,8 +70,8 @@ def coordinates_over_time(axes: NDArray[np.object_], evaluation: Evaluation) -> 
     stamps_s, centres = seconds(evaluation, run.trajectory.stamps_ns), run.trajectory.T_world_cam[:, :3, 3]
     for axis, (ax, name) in enumerate(zip(axes, ('x, right (m)', 'y, down (m)', 'z, forward (m)'))):
         if evaluation.truth is not None:
-            truth = _truth_in_span(evaluation)
-            ax.plot(_truth_seconds(evaluation), truth[:, axis], color=TRUTH, lw=3, label='truth')
+            truth_s, truth_m = _truth_in_span(evaluation, evaluation.truth)
+            ax.plot(truth_s, truth_m[:, axis], color=TRUTH, lw=3, label='truth')
         curve = _broken(evaluation, run.trajectory.stamps_ns, stamps_s, centres[:, axis])
         ax.plot(*curve, color=ESTIMATE, lw=1.3, label='estimate')
         _mark_lost(ax, evaluation)
@@ -193,18 +194,11 @@ def _difference_limit_cm(difference_cm: FloatImage) -> float:
     return next((limit for limit in (5.0, 10.0, 20.0, 50.0, 100.0) if needed <= limit), 200.0)
 
 
-def _truth_in_span(evaluation: Evaluation) -> NDArray[np.float64]:
-    return evaluation.truth.truth.T_world_cam[_truth_span(evaluation), :3, 3]
-
-
-def _truth_seconds(evaluation: Evaluation) -> NDArray[np.float64]:
-    return seconds(evaluation, evaluation.truth.truth.stamps_ns[_truth_span(evaluation)])
-
-
-def _truth_span(evaluation: Evaluation) -> NDArray[np.bool_]:
-    """Which truth poses lie within the run's time."""
-    stamps, ours = evaluation.truth.truth.stamps_ns, evaluation.run.trajectory.stamps_ns
-    return (stamps >= ours[0]) & (stamps <= ours[-1])
+def _truth_in_span(evaluation: Evaluation, truth: TruthEvaluation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Time in seconds [N] and camera centres [N, 3] of the truth while the run lasted."""
+    stamps, ours = truth.truth.stamps_ns, evaluation.run.trajectory.stamps_ns
+    during = (stamps >= ours[0]) & (stamps <= ours[-1])
+    return seconds(evaluation, stamps[during]), truth.truth.T_world_cam[during, :3, 3]
 
 
 def _connected(evaluation: Evaluation, stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:

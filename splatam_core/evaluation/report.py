@@ -68,8 +68,8 @@ def draw_report(evaluation: Evaluation) -> Figure:
 
 
 def _draw_header(figure: SubFigure, evaluation: Evaluation) -> None:
-    figure.text(0.012, 0.86, evaluation.run.path.resolve().name, fontsize=20, fontweight='bold', va='center')
-    figure.text(0.012, 0.64, _subtitle(evaluation), fontsize=10, color=plots.MUTED, va='center')
+    figure.text(0.012, 0.86, _plain(evaluation.run.path.resolve().name), fontsize=20, fontweight='bold', va='center')
+    figure.text(0.012, 0.64, _plain(_subtitle(evaluation)), fontsize=10, color=plots.MUTED, va='center')
     tiles = _tiles(evaluation)
     for index, (value, unit, name) in enumerate(tiles):
         x = 0.012 + index * (0.98 / len(tiles))
@@ -96,6 +96,11 @@ def _subtitle(evaluation: Evaluation) -> str:
         f'commit {run.commit[:10]}{"-dirty" if run.commit.endswith("-dirty") else ""}' if run.commit else '',
     ]
     return '   ·   '.join(part for part in parts if part)
+
+
+def _plain(text: str) -> str:
+    """Without what matplotlib would take for mathematics."""
+    return text.replace('$', r'\$')
 
 
 def _tiles(evaluation: Evaluation) -> list[tuple[str, str, str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,19 +89,13 @@ class Evaluation:
 
 
 def combine(run: RunRecord, truth: TruthEvaluation | None, images: ImageEvaluation | None) -> Evaluation:
-    """The run's numbers with those of the truth and of the images filled in, null where there is none."""
-    scores = mean_scores(images.frames if images else ())
-    metrics = replace(
-        run.metrics(),
-        ate_rmse_m=truth.error.rmse_m if truth else None,
-        ate_frames=len(truth.error.stamps_ns) if truth else None,
-        psnr_db=scores.psnr_db,
-        ssim=scores.ssim,
-        depth_l1_m=scores.depth_l1_m,
-        psnr_full_db=scores.psnr_full_db,
-        evaluated_every=images.every if images else None,
-        evaluated_frames=len(images.frames) if images else None,
-    )
+    """The run's numbers with those of the truth and of the images filled in; without one, its numbers stay."""
+    metrics = run.metrics()
+    if truth is not None:
+        metrics = replace(metrics, ate_rmse_m=truth.error.rmse_m, ate_frames=len(truth.error.stamps_ns))
+    if images is not None:
+        scores = asdict(mean_scores(images.frames))
+        metrics = replace(metrics, **scores, evaluated_every=images.every, evaluated_frames=len(images.frames))
     return Evaluation(run, metrics, truth, images)
 
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core import se3
 from splatam_core.errors import RunFolderError
 from splatam_core.trajectory import stamp_text
 from splatam_core.types import Trajectory

@@ -25,6 +25,7 @@ from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status, Tra
 
 CONFIG = load_config('quick', ['threads=1'])
 STEP_NS, COUNT, LOST = 33_333_333, 9, 4
+CAMERA = PinholeCamera(48, 36, 40.0, 40.0, 23.5, 17.5)
 T_TRUTH_WORLD = se3.exp(np.array([3.0, -1.0, 2.0, 0.3, 1.0, -0.5]))
 
 
@@ -32,7 +33,7 @@ T_TRUTH_WORLD = se3.exp(np.array([3.0, -1.0, 2.0, 0.3, 1.0, -0.5]))
 class Wall:
     """A recording of a coloured wall made of Gaussians, past which the camera moves on an arc."""
 
-    camera: PinholeCamera = PinholeCamera(48, 36, 40.0, 40.0, 23.5, 17.5)
+    camera: PinholeCamera = CAMERA
     name: str = 'wall'
     depth_scale: float | None = None
     first_ns: int = 10**18
@@ -50,7 +51,8 @@ class Wall:
 
     def pose(self, index: int) -> np.ndarray:
         angle = 0.1 * index
-        return se3.exp(np.array([0.3 * math.sin(angle), 0.02 * index**2 / COUNT, 0.2 - 0.2 * math.cos(angle), 0, 0, angle]))
+        x, y, z = 0.3 * math.sin(angle), 0.02 * index**2 / COUNT, 0.2 - 0.2 * math.cos(angle)
+        return se3.exp(np.array([x, y, z, 0, 0, angle]))
 
     def __getitem__(self, index: int) -> RgbdFrame:
         if index in self.damaged:
@@ -75,11 +77,9 @@ def make_run(path: Path, sequence: Wall, with_map: bool = True, program: str = '
             pose = None if index == LOST else sequence.pose(index)
             status = Status.LOST if pose is None else Status.TRACKED
             timings = StageTimings(track=20.0, densify=1.0, keyframes=0.5, map=30.0 + index, total=52.0 + index)
-            folder.append(
-                sequence[index],
-                FrameResult(index, sequence.first_ns + index * STEP_NS, status, pose, index % 4 == 0, 4800, 1, 1, '', timings),
-                0.05, 0.01,
-            )  # fmt: skip
+            frame, is_keyframe = sequence[index], index % 4 == 0
+            result = FrameResult(index, frame.stamp_ns, status, pose, is_keyframe, 4800, 1.0, 1.0, '', timings)
+            folder.append(frame, result, 0.05, 0.01)
     if with_map:
         write_ply(path / MAP, sequence.gaussians)
     return read_run(path)
@@ -92,7 +92,8 @@ def plain(indices: range) -> range:
 def test_a_perfect_run_scores_perfectly(tmp_path: Path) -> None:
     sequence = Wall()
     run = make_run(tmp_path, sequence)
-    metrics = combine(run, score_trajectory(run, sequence.ground_truth()), score_images(run, sequence, 1, plain)).metrics
+    truth, images = score_trajectory(run, sequence.ground_truth()), score_images(run, sequence, 1, plain)
+    metrics = combine(run, truth, images).metrics
     assert metrics.ate_rmse_m == pytest.approx(0, abs=1e-8)  # nine decimals in the file
     assert metrics.psnr_db > 55  # 8-bit rounding alone gives 58.9
     assert metrics.depth_l1_m == pytest.approx(0, abs=1e-5)
@@ -112,7 +113,8 @@ def test_frames_are_matched_by_stamp(tmp_path: Path) -> None:
     run = make_run(tmp_path, Wall())
     earlier = Wall(first_ns=10**18 - 2 * STEP_NS)
     images = score_images(run, earlier, 1, plain)
-    assert [frame.stamp_ns for frame in images.frames] == [10**18 + STEP_NS * index for index in range(7) if index != LOST]
+    both = [10**18 + STEP_NS * index for index in range(COUNT - 2) if index != LOST]
+    assert [frame.stamp_ns for frame in images.frames] == both
     assert images.frames[0].scores.psnr_db < 40  # the picture of index 2 at the pose of index 0
 
 
@@ -134,7 +136,7 @@ def test_no_map_is_an_error(tmp_path: Path) -> None:
 
 def test_another_size_is_scored_in_that_size(tmp_path: Path) -> None:
     run = make_run(tmp_path, Wall())
-    assert score_images(run, Wall(camera=Wall().camera.resized(96, 72)), 1, plain).samples[0].rgb.shape == (72, 96, 3)
+    assert score_images(run, Wall(camera=CAMERA.resized(96, 72)), 1, plain).samples[0].rgb.shape == (72, 96, 3)
 
 
 def test_samples_go_from_worst_to_best(tmp_path: Path) -> None:

@@ -82,7 +82,8 @@ def test_where_the_truth_has_its_world_changes_nothing(seed: int) -> None:
 def test_independent_noise_shows_in_full() -> None:
     truth, sigma, count = wandering(2000), 0.02, 2000
     noise = np.random.default_rng(1).normal(0, sigma, (count, 3))
-    # 3 N noisy numbers less the 6 a rigid motion fits; the sum of squares strays by sqrt(2 / 3 N) = 1.8 %, half in the root.
+    # 3 N noisy numbers less the 6 a rigid motion fits. The sum of their squares strays by sqrt(2 / 3 N) = 1.8 %,
+    # its root by half of that: 3 % is over three sigma.
     expected = sigma * np.sqrt(3 * (1 - 6 / (3 * count)))
     assert trajectory_error(moved(truth, noise), truth).rmse_m == pytest.approx(expected, rel=0.03)
 
@@ -126,7 +127,7 @@ def test_frames_without_a_truth_are_not_scored() -> None:
 def test_rounded_stamps_at_the_ends_still_count() -> None:
     truth = wandering(5)
     just_outside = np.array([truth.stamps_ns[0] - STAMP_ROUNDING_NS, truth.stamps_ns[-1] + STAMP_ROUNDING_NS])
-    too_far = just_outside + [-1, 1]
+    too_far = just_outside + np.array([-1, 1])
     assert interpolate_centres(truth, just_outside)[1].all()
     assert not interpolate_centres(truth, too_far)[1].any()
 

@@ -12,9 +12,10 @@ from splatam_core.errors import MapFileError
 from splatam_core.ply import PROPERTIES, SH_C0, read_ply, write_ply
 from splatam_core.rasterizer.base import Gaussians
 
-STANDARD = (
-    'x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3'.split()
-)  # the order of the original 3D Gaussian splatting exporter, degree 0
+STANDARD = [  # the order of the original 3D Gaussian splatting exporter, degree 0
+    'x', 'y', 'z', 'nx', 'ny', 'nz', 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', 'scale_0', 'scale_1', 'scale_2',
+    'rot_0', 'rot_1', 'rot_2', 'rot_3',
+]  # fmt: skip
 
 
 def some_gaussians(count: int) -> Gaussians:
@@ -83,7 +84,7 @@ def test_anisotropic_maps_are_refused(tmp_path: Path) -> None:
     rows = np.zeros(2, dtype=dtype)
     rows['scale_1'] = [0, 1]
     other_map(tmp_path / 'other.ply', dtype, rows)
-    with pytest.raises(MapFileError, match='not isotropic'):
+    with pytest.raises(MapFileError, match='only isotropic'):
         read_ply(tmp_path / 'other.ply')
 
 
@@ -91,7 +92,7 @@ def test_anisotropic_maps_are_refused(tmp_path: Path) -> None:
     ('old', 'new', 'message'),
     [
         (b'ply\n', b'PK\x03\x04', 'not a PLY file'),
-        (b'binary_little_endian', b'ascii', "'ascii 1.0'; only binary_little_endian"),
+        (b'binary_little_endian', b'ascii', 'only format binary_little_endian 1.0 is read'),
         (b'element vertex 5', b'element face 5', "first element must be 'vertex'"),
         (b'element vertex 5', b'element vertex -5', "'-5' is not a number"),
         (b'element vertex 5', b'element vertex 6', 'cut short'),

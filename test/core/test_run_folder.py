@@ -41,7 +41,8 @@ def result(index: int, status: Status = Status.TRACKED, total_ms: float = 10.0) 
     pose = None if status is Status.LOST else se3.exp(np.array([0.01, 0.02, -0.01, 0.1, 0, 0.05]) * index)
     reason = 'too few inliers, "bad"' if pose is None else ''
     timings = StageTimings(track=total_ms * 0.6, map=total_ms * 0.4, total=total_ms)
-    return FrameResult(index, frame(index).stamp_ns, status, pose, index % 2 == 0, 100 + index, 0.9, 0.8, reason, timings)
+    stamp_ns = 10**18 + index * STEP_NS
+    return FrameResult(index, stamp_ns, status, pose, index % 2 == 0, 100 + index, 0.9, 0.8, reason, timings)
 
 
 def tree(path: Path) -> dict[str, bytes]:
@@ -111,9 +112,8 @@ def test_finish_saves_map_and_metrics(tmp_path: Path) -> None:
     assert Metrics.from_json((tmp_path / 'metrics.json').read_text()) == metrics == read_run(tmp_path).metrics()
     assert (metrics.frames, metrics.tracked, metrics.fps, metrics.fps_with_io) == (2, 2, 2.0, None)
     written = json.loads((tmp_path / 'metrics.json').read_text())
-    assert {name: written[name] for name in ('ate_rmse_m', 'psnr_db', 'ssim', 'depth_l1_m', 'psnr_full_db')} == dict.fromkeys(
-        ('ate_rmse_m', 'psnr_db', 'ssim', 'depth_l1_m', 'psnr_full_db')
-    )
+    unknown = 'ate_rmse_m', 'psnr_db', 'ssim', 'depth_l1_m', 'psnr_full_db'
+    assert {name: written[name] for name in unknown} == dict.fromkeys(unknown)
     assert 10 < metrics.peak_rss_mb < 100_000
     with pytest.raises(ValueError, match='closed'):
         folder.append(frame(2), result(2), 0.1)
@@ -161,9 +161,10 @@ def test_overwrite_removes_a_run_and_nothing_else(tmp_path: Path) -> None:
         folder.append(frame(0), result(0), 0.1)
     (run / 'checkpoints').mkdir()
     (run / 'checkpoints' / '1').touch()
+    (run / '.map.ply.4242').touch()  # of a writer that was killed
     RunFolder.create(run, CONFIG, OFFLINE, overwrite=True).close()
     assert read_run(run).description == OFFLINE and len(read_run(run).trajectory) == 0
-    assert not (run / 'checkpoints').exists()
+    assert not (run / 'checkpoints').exists() and not (run / '.map.ply.4242').exists()
 
     (run / 'thesis.tex').write_text('years of work')
     before = tree(run)
@@ -185,7 +186,7 @@ def test_other_folders_and_files_stay(tmp_path: Path, overwrite: bool) -> None:
 
 
 def test_no_run_folder_and_damaged_ones_are_one_line(tmp_path: Path) -> None:
-    with pytest.raises(RunFolderError, match='is no run folder: it has no trajectory.txt, config.yaml, run.json'):
+    with pytest.raises(RunFolderError, match=r'is no run folder: it has no trajectory\.txt, config\.yaml, run\.json'):
         read_run(tmp_path)
     RunFolder.create(tmp_path, CONFIG, NODE).close()
     for name, text in (
