@@ -1,0 +1,78 @@
+"""Losses: values worked out by hand, gradients against finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from splatam_core.camera import PinholeCamera
+from splatam_core.losses import mapping_loss, ssim_map, tracking_loss
+from splatam_core.rasterizer import Render
+from splatam_core.view import View
+
+CAMERA = PinholeCamera(6, 4, 5.0, 5.0, 3.0, 2.0)
+
+
+def _view() -> View:
+    depth = torch.full((4, 6), 2.0)
+    depth[0] = 0.0
+    return View(CAMERA, torch.full((3, 4, 6), 0.5), depth, depth > 0)
+
+
+def _render(rgb: float, depth: float, silhouette: torch.Tensor) -> Render:
+    return Render(torch.full((3, 4, 6), rgb), torch.full((4, 6), depth), silhouette)
+
+
+def test_tracking_loss_sums_where_the_map_is_sure_and_depth_is_read() -> None:
+    silhouette = torch.zeros(4, 6)
+    silhouette[:, :3] = 1.0
+    loss = tracking_loss(_render(0.6, 2.3, silhouette), _view(), 0.99, 0.5, 1.0)
+    pixels = 3 * 3  # three columns sure, three rows with depth
+    assert float(loss) == pytest.approx(pixels * (1.0 * 0.3 + 0.5 * 3 * 0.1), rel=1e-5)
+
+
+def test_mapping_loss_means_depth_over_readings_and_colour_over_all() -> None:
+    loss = mapping_loss(_render(0.6, 2.3, torch.zeros(4, 6)), _view(), 0.0, 0.5, 1.0)
+    assert float(loss) == pytest.approx(0.3 + 0.5 * 0.1, rel=1e-5)
+
+
+def test_mapping_loss_of_a_view_without_depth_is_the_colour_loss() -> None:
+    depth = torch.zeros(4, 6)
+    view = View(CAMERA, torch.full((3, 4, 6), 0.5), depth, depth > 0)
+    loss = mapping_loss(_render(0.6, 2.3, torch.zeros(4, 6)), view, 0.0, 0.5, 1.0)
+    assert float(loss) == pytest.approx(0.05, rel=1e-5)
+
+
+def test_ssim_of_equal_images_is_one_and_falls_with_noise() -> None:
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(3, 40, 30, generator=generator)
+    noise = torch.randn(3, 40, 30, generator=generator)
+    torch.testing.assert_close(ssim_map(image, image), torch.ones(3, 40, 30))
+    means = [float(ssim_map(image, image + level * noise).mean()) for level in (0.05, 0.1, 0.3)]
+    assert 1 > means[0] > means[1] > means[2] > 0
+
+
+def test_ssim_by_hand_in_the_middle_of_an_image() -> None:
+    """One pixel's value from its definition: Gaussian-weighted means, variances and covariance."""
+    rng = np.random.default_rng(1)
+    a, b = rng.random((2, 21, 21))
+    offsets = np.arange(11) - 5
+    window = np.exp(-(offsets[:, None] ** 2 + offsets[None] ** 2) / (2 * 1.5**2))
+    window /= window.sum()
+    pa, pb = a[5:16, 5:16], b[5:16, 5:16]
+    mean_a, mean_b = (window * pa).sum(), (window * pb).sum()
+    var_a, var_b = (window * pa**2).sum() - mean_a**2, (window * pb**2).sum() - mean_b**2
+    covariance = (window * pa * pb).sum() - mean_a * mean_b
+    expected = (2 * mean_a * mean_b + 1e-4) * (2 * covariance + 9e-4)
+    expected /= (mean_a**2 + mean_b**2 + 1e-4) * (var_a + var_b + 9e-4)
+    stack = lambda image: torch.from_numpy(np.stack([image] * 3))  # noqa: E731
+    assert float(ssim_map(stack(a), stack(b))[0, 10, 10]) == pytest.approx(expected, rel=1e-9)
+
+
+def test_ssim_gradients() -> None:
+    """Central differences in float64; 1e-5 is what a step of 1e-6 resolves."""
+    generator = torch.Generator().manual_seed(2)
+    a = torch.rand(3, 14, 13, generator=generator, dtype=torch.float64, requires_grad=True)
+    b = torch.rand(3, 14, 13, generator=generator, dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda image: ssim_map(image, b), (a,), eps=1e-6, atol=1e-5)

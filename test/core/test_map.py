@@ -1,0 +1,194 @@
+"""Growing, pruning and refining the map."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from splatam_core.camera import PinholeCamera
+from splatam_core.config import DensificationConfig, KeyframeConfig, MappingConfig
+from splatam_core.densification import densify, new_gaussians, unexplained
+from splatam_core.gaussian_map import PARAMETERS, GaussianMap
+from splatam_core.keyframes import PosedView, overlap, select_window
+from splatam_core.mapping import prunable, refine
+from splatam_core.rasterizer import Render, make_rasterizer
+from splatam_core.view import View
+
+CAMERA = PinholeCamera(32, 24, 30.0, 30.0, 15.5, 11.5)
+EYE = torch.eye(4)
+RATES = {'means': 1e-4, 'log_scales': 1e-3, 'logit_opacities': 0.05, 'rgb': 2.5e-3}
+
+
+def _view(depth_m: float = 2.0) -> View:
+    """A wall with a smooth pattern."""
+    v, u = torch.meshgrid(torch.arange(24.0), torch.arange(32.0), indexing='ij')
+    rgb = torch.stack([0.5 + 0.4 * torch.sin(u / 3), 0.5 + 0.4 * torch.cos(v / 4), 0.5 + 0.01 * u])
+    depth = torch.full((24, 32), depth_m)
+    return View(CAMERA, rgb, depth, depth > 0)
+
+
+def _map(view: View) -> GaussianMap:
+    result = GaussianMap()
+    result.append(new_gaussians(view, view.valid, EYE, 0.5))
+    return result
+
+
+def _at(x: float, turn: float = 0.0) -> torch.Tensor:
+    """World to camera: at x, turned about the vertical."""
+    c, s = math.cos(turn), math.sin(turn)
+    R = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    T = torch.eye(4)
+    T[:3, :3], T[:3, 3] = R, -R @ torch.tensor([x, 0.0, 0.0])
+    return T
+
+
+def test_new_gaussians_lie_on_their_pixels() -> None:
+    """Position, width of one pixel, colour, opacity; from a moved camera."""
+    view, T = _view(), _at(0.3, 0.2)
+    gaussians = new_gaussians(view, view.valid, T, 0.5)
+    camera = gaussians.means @ T[:3, :3].T + T[:3, 3]
+    u = CAMERA.fx * camera[:, 0] / camera[:, 2] + CAMERA.cx
+    torch.testing.assert_close(u.view(24, 32)[7], torch.arange(32.0), atol=1e-4, rtol=0)  # float32 at 32 px
+    torch.testing.assert_close(camera[:, 2], torch.full((768,), 2.0))
+    torch.testing.assert_close(gaussians.log_scales.exp(), torch.full((768, 1), 2.0 / 30.0))
+    torch.testing.assert_close(gaussians.rgb.T.reshape(3, 24, 32), view.rgb)
+    assert not gaussians.logit_opacities.any()
+
+
+def test_a_fresh_wall_renders_above_the_tracking_gate() -> None:
+    """One Gaussian per pixel at opacity 0.5 covers to 0.99: start values and gate belong together (facts, section 3)."""
+    render = make_rasterizer('cpu', 1).render(_map(_view()).gaussians, CAMERA, EYE)
+    assert float(render.silhouette[8:16, 8:24].min()) > 0.99
+
+
+def test_densification_adds_nothing_where_the_map_explains_the_view() -> None:
+    view = _view()
+    added = densify(_map(view).gaussians, view, EYE, make_rasterizer('cpu', 1), DensificationConfig())
+    assert len(added) == 0
+
+
+def test_densification_adds_unmapped_pixels_with_a_reading() -> None:
+    view = _view()
+    unseen = view.valid.clone()
+    unseen[:, 16:] = False
+    half = GaussianMap()
+    half.append(new_gaussians(view, unseen, EYE, 0.5))
+    added = densify(half.gaussians, view, EYE, make_rasterizer('cpu', 1), DensificationConfig())
+    u = CAMERA.fx * added.means[:, 0] / added.means[:, 2] + CAMERA.cx
+    assert 24 * 13 <= len(added) <= 24 * 16
+    assert float(u.min()) > 15.5
+
+
+def test_densification_adds_what_stands_in_front_of_the_map() -> None:
+    """A new object: 64 pixels far nearer than the mapped wall; the wall's own noise adds nothing."""
+    wall = _view()
+    generator = torch.Generator().manual_seed(0)
+    depth = wall.depth + 0.002 * torch.randn(24, 32, generator=generator)
+    depth[8:16, 8:16] = 1.2
+    depth[0:2] = 0.0  # no reading: must neither count in the median nor be added
+    view = View(CAMERA, wall.rgb, depth, depth > 0)
+    render = make_rasterizer('cpu', 1).render(_map(wall).gaussians, CAMERA, EYE)
+    chosen = unexplained(render, view, DensificationConfig())
+    assert chosen[8:16, 8:16].all()
+    chosen[8:16, 8:16] = False
+    assert not chosen[2:-2, 2:-2].any()
+
+
+def test_densification_at_half_resolution_adds_a_quarter_of_wider_gaussians() -> None:
+    view = _view()
+    empty = GaussianMap()
+    added = densify(empty.gaussians, view, EYE, make_rasterizer('cpu', 1), DensificationConfig(scale=0.5))
+    assert len(added) == 24 * 32 // 4
+    torch.testing.assert_close(added.log_scales.exp(), torch.full((192, 1), 2.0 / 15.0))
+
+
+def test_mapping_makes_the_render_look_like_the_view() -> None:
+    view = _view()
+    gaussian_map = _map(view)
+    gaussian_map.rgb = gaussian_map.rgb * 0.7
+    rasterizer = make_rasterizer('cpu', 1)
+
+    def error(render: Render) -> float:
+        return float((render.rgb - view.rgb).abs().mean())
+
+    before = error(rasterizer.render(gaussian_map.gaussians, CAMERA, EYE))
+    window = [PosedView(view, EYE)]
+    refine(gaussian_map, window, rasterizer, MappingConfig(iterations=60), 1.0, np.random.default_rng(0))
+    after = error(rasterizer.render(gaussian_map.gaussians, CAMERA, EYE))
+    assert after < 0.5 * before
+
+
+def test_pruning_drops_the_faint_and_the_wide() -> None:
+    gaussian_map = _map(_view())
+    gaussian_map.logit_opacities[3] = math.log(0.004 / 0.996)
+    gaussian_map.log_scales[5] = math.log(0.11)
+    chosen = prunable(gaussian_map, MappingConfig(), scene_radius=1.0)
+    assert torch.nonzero(chosen)[:, 0].tolist() == [3, 5]
+
+
+def test_keep_takes_gradients_and_moments_along() -> None:
+    """A step after pruning moves each survivor exactly as without pruning."""
+    view = _view()
+    pruned, whole = _map(view), _map(view)
+    kept = torch.ones(len(whole), dtype=torch.bool)
+    kept[::3] = False
+    for gaussian_map in (pruned, whole):
+        gaussian_map.start_optimization(RATES)
+    for step in range(3):
+        generator = torch.Generator().manual_seed(step)
+        slopes = {name: torch.randn(getattr(whole, name).shape, generator=generator) for name in PARAMETERS}
+        for name in PARAMETERS:
+            getattr(whole, name).grad = slopes[name].clone()
+            own = slopes[name] if len(pruned) == len(whole) else slopes[name][kept]
+            getattr(pruned, name).grad = own.clone()
+        if step == 1:
+            pruned.keep(kept)
+        for gaussian_map in (pruned, whole):
+            gaussian_map.step()
+    for name in PARAMETERS:
+        assert torch.equal(getattr(pruned, name), getattr(whole, name)[kept]), name
+
+
+def test_snapshot_stays_as_it_was() -> None:
+    gaussian_map = _map(_view())
+    snapshot = gaussian_map.snapshot()
+    means = snapshot.means.copy()
+    gaussian_map.means += 1.0
+    gaussian_map.append(gaussian_map.gaussians)
+    np.testing.assert_array_equal(snapshot.means, means)
+    np.testing.assert_allclose(snapshot.opacities, 0.5)
+
+
+def test_overlap_is_the_share_seen_inside_the_margin() -> None:
+    view = _view()
+    points = view.points(view.valid)
+    assert overlap(points, PosedView(view, EYE), 0) == pytest.approx(1.0, abs=0.1)  # the outermost pixels are on the rim
+    assert overlap(points, PosedView(view, EYE), 8) == pytest.approx(15 * 7 / 768, abs=0.01)
+    assert overlap(points, PosedView(view, _at(0.0, math.pi)), 0) == 0.0
+    assert overlap(points[:0], PosedView(view, EYE), 0) == 0.0
+
+
+def test_window_holds_overlapping_keyframes_the_last_and_the_current() -> None:
+    view = _view()
+    near = [PosedView(view, _at(0.01 * k)) for k in range(6)]
+    away = [PosedView(view, _at(0.0, math.pi)) for _ in range(4)]
+    last, current = PosedView(view, _at(9.0)), PosedView(view, EYE)
+    config = KeyframeConfig(window=5, overlap_margin=2)
+    rng = np.random.default_rng(0)
+    windows = [select_window(current, [*near, *away, last], config, rng) for _ in range(20)]
+    for window in windows:
+        assert len(window) == 5
+        assert window[-2] is last and window[-1] is current
+        assert all(any(w is k for k in near) for w in window[:-2])
+        assert len({id(w) for w in window}) == 5
+    assert len({frozenset(map(id, window)) for window in windows}) > 1  # random, not always the same
+
+
+def test_window_of_one_and_of_the_first_frame() -> None:
+    current = PosedView(_view(), EYE)
+    rng = np.random.default_rng(0)
+    assert select_window(current, [], KeyframeConfig(), rng) == [current]
+    assert select_window(current, [current], KeyframeConfig(window=1), rng) == [current]
