@@ -1,0 +1,139 @@
+"""``sensor_msgs/CameraInfo``: the camera of the image as it was sent, binned and cropped.
+
+A pixel's centre is its integer index: cropping subtracts the offset, binning by ``b`` maps
+``f' = f / b`` and ``c' = (c + 0.5) / b - 0.5``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from msg_adapters import stamps
+from msg_adapters.errors import MessageError
+from msg_adapters.factory import MessageFactory
+
+# Number of coefficients by model; fewer mean that the others are zero.
+COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
+_NO_DISTORTION = ('', 'none', 'pinhole')
+
+
+@dataclass(frozen=True, slots=True)
+class CameraParameters:
+    """What a CameraInfo says about the image it belongs to.
+
+    Attributes:
+        width, height: size of the image in pixels, after binning and cropping.
+        fx, fy: focal lengths in those pixels.
+        cx, cy: principal point; a pixel's centre is its integer index.
+        distortion_model: none, plumb_bob, rational_polynomial or equidistant.
+        distortion: 0, 5, 8 or 4 coefficients in OpenCV's order.
+        frame_id: the optical frame of the camera.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion_model: str = 'none'
+    distortion: tuple[float, ...] = ()
+    frame_id: str = ''
+
+
+def parameters(message: Any) -> CameraParameters:
+    """Read a ``sensor_msgs/CameraInfo``; K and D are used, binning and region of interest applied.
+
+    A model whose coefficients are all zero is 'none'. That holds for 'equidistant' too: an info like
+    that comes with rectified images, no calibration finds exact zeros.
+
+    Raises:
+        MessageError: K is not calibrated, the size is zero, the distortion model is unknown or has too
+            many coefficients, or the region of interest is not within the image.
+    """
+    fx, cx, fy, cy = _intrinsics(message)
+    model, coefficients = _distortion(message)
+    full = CameraParameters(
+        int(message.width), int(message.height), fx, fy, cx, cy, model, coefficients, message.header.frame_id
+    )
+    if full.width < 1 or full.height < 1:
+        raise MessageError(f'CameraInfo says the image is {full.width}x{full.height}; fill in width and height')
+    return _binned(_cropped(full, message.roi), int(message.binning_x), int(message.binning_y))
+
+
+def _intrinsics(message: Any) -> tuple[float, float, float, float]:
+    k = [float(value) for value in message.k]
+    if not (np.isfinite(k).all() and k[0] > 0 and k[4] > 0):
+        raise MessageError(
+            f'CameraInfo K = {k}: focal lengths must be positive and all values finite; '
+            'the camera is not calibrated, or its driver does not publish the calibration'
+        )
+    return k[0], k[2], k[4], k[5]
+
+
+def _distortion(message: Any) -> tuple[str, tuple[float, ...]]:
+    model, values = message.distortion_model, [float(value) for value in message.d]
+    if model not in COEFFICIENTS and (model not in _NO_DISTORTION or any(values)):
+        raise MessageError(
+            f"CameraInfo distortion model '{model}' with D = {values} is not supported; "
+            f'supported are {", ".join(COEFFICIENTS)}, or no distortion (D all zero); rectify the images first'
+        )
+    if not np.isfinite(values).all():
+        raise MessageError(f'CameraInfo D = {values}: coefficients must be finite; calibrate the camera')
+    if not any(values):
+        return 'none', ()
+    count = COEFFICIENTS[model]
+    if any(values[count:]):
+        raise MessageError(f'CameraInfo D = {values}: {model} has {count} coefficients, the others must be zero')
+    return model, tuple((values + [0.0] * count)[:count])
+
+
+def _cropped(camera: CameraParameters, roi: Any) -> CameraParameters:
+    x, y, width, height = int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height)
+    if width == height == 0:  # the ROS way to say: the whole image
+        return camera
+    if not (0 < width <= camera.width - x and 0 < height <= camera.height - y):
+        raise MessageError(
+            f'CameraInfo region of interest {width}x{height} at ({x}, {y}) is not within the '
+            f'{camera.width}x{camera.height} image; width and height 0 mean the whole image'
+        )
+    return replace(camera, width=width, height=height, cx=camera.cx - x, cy=camera.cy - y)
+
+
+def _binned(camera: CameraParameters, binning_x: int, binning_y: int) -> CameraParameters:
+    bx, by = max(1, binning_x), max(1, binning_y)  # 0 means 1 in ROS
+    if bx > camera.width or by > camera.height:
+        raise MessageError(f'CameraInfo binning {bx}x{by} leaves no pixel of the {camera.width}x{camera.height} image')
+    return replace(
+        camera, width=camera.width // bx, height=camera.height // by, fx=camera.fx / bx, fy=camera.fy / by,
+        cx=(camera.cx + 0.5) / bx - 0.5, cy=(camera.cy + 0.5) / by - 0.5,
+    )  # fmt: skip
+
+
+def info_message(factory: MessageFactory, camera: CameraParameters, stamp_ns: int) -> Any:
+    """A ``sensor_msgs/CameraInfo`` of a monocular camera: R is the identity, P holds K.
+
+    No distortion is said the way rectified ROS cameras say it: 'plumb_bob' with five zeros.
+    """
+    is_distorted = camera.distortion_model != 'none'
+    k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1], dtype=np.float64)
+    roi = factory.make(
+        'sensor_msgs/msg/RegionOfInterest', x_offset=0, y_offset=0, width=0, height=0, do_rectify=False
+    )
+    return factory.make(
+        'sensor_msgs/msg/CameraInfo',
+        header=stamps.header(factory, stamp_ns, camera.frame_id),
+        height=camera.height,
+        width=camera.width,
+        distortion_model=camera.distortion_model if is_distorted else 'plumb_bob',
+        d=np.array(camera.distortion if is_distorted else [0.0] * 5, dtype=np.float64),
+        k=k,
+        r=np.eye(3).reshape(-1),
+        p=np.hstack([k.reshape(3, 3), np.zeros((3, 1))]).reshape(-1),
+        binning_x=0,
+        binning_y=0,
+        roi=roi,
+    )

@@ -1,0 +1,156 @@
+"""``sensor_msgs/CompressedImage`` as image_transport's plugins write it: JPEG and PNG, and PNG depth.
+
+The format field says ``rgb8; jpeg compressed bgr8``, ``16UC1; png compressed``, ``32FC1; compressedDepth png``
+or just ``jpeg``. The compressedDepth data start with 12 bytes: an int32 and the floats A and B. Stored
+counts are millimetres for 16UC1; for 32FC1 they are inverse depth, ``count = A / metres + B``, 0 = no reading.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from msg_adapters import stamps
+from msg_adapters.encodings import Depth, Rgb, clean_metres, metres_from_millimetres
+from msg_adapters.errors import MessageError
+from msg_adapters.factory import MessageFactory
+from msg_adapters.pixels import checked_depth, checked_rgb, millimetres
+
+_CONFIG = struct.Struct('<iff')
+_JPEG, _PNG = b'\xff\xd8', b'\x89PNG'
+_LARGEST_COUNT = 65535
+
+
+def decode_color(message: Any) -> Rgb:
+    """[H, W, 3] RGB of a JPEG or PNG.
+
+    Raises:
+        MessageError: the message holds depth, another codec, or damaged data.
+    """
+    if 'compressedDepth' in message.format:
+        raise MessageError(f"colour image has format '{message.format}', which is depth; check the topics' remapping")
+    return cv2.cvtColor(_decoded(bytes(message.data), cv2.IMREAD_COLOR, message.format), cv2.COLOR_BGR2RGB)
+
+
+def decode_depth(message: Any) -> Depth:
+    """[H, W] metres of a PNG, 0 = no reading.
+
+    Raises:
+        MessageError: the message holds colour, another codec, or damaged data.
+    """
+    data, depth_format = bytes(message.data), message.format
+    if 'compressedDepth' not in depth_format:
+        return metres_from_millimetres(_depth_counts(data, depth_format))
+    if len(data) < _CONFIG.size:
+        raise MessageError(f"depth image with format '{depth_format}' has {len(data)} bytes; it is truncated")
+    if 'rvl' in depth_format:
+        raise MessageError(f"depth image has format '{depth_format}'; only png is supported, set the publisher to it")
+    _, a, b = _CONFIG.unpack_from(data)
+    counts = _depth_counts(data[_CONFIG.size :], depth_format)
+    encoding = depth_format.split(';')[0].strip()
+    if encoding in ('16UC1', 'mono16'):
+        return metres_from_millimetres(counts)
+    if encoding == '32FC1':
+        return _metres_from_inverse(counts, a, b)
+    raise MessageError(f"depth image has format '{depth_format}'; it must begin with 16UC1, mono16 or 32FC1")
+
+
+def _metres_from_inverse(counts: NDArray[np.uint16], a: float, b: float) -> Depth:
+    with np.errstate(divide='ignore'):
+        depth_m = np.float32(a) / (counts.astype(np.float32) - np.float32(b))
+    return clean_metres(np.where(counts > 0, depth_m, np.float32(0)))
+
+
+def _depth_counts(data: bytes, depth_format: str) -> NDArray[np.uint16]:
+    counts = _decoded(data, cv2.IMREAD_UNCHANGED, depth_format)
+    if counts.ndim != 2 or counts.dtype != np.uint16:
+        raise MessageError(
+            f"depth image with format '{depth_format}' holds {counts.dtype} pixels of shape {counts.shape}; "
+            'depth must be one 16-bit channel; is this the depth topic?'
+        )
+    return counts
+
+
+def _decoded(data: bytes, flags: int, image_format: str) -> NDArray[Any]:
+    if not data.startswith((_JPEG, _PNG)):
+        raise MessageError(f"compressed image with format '{image_format}' holds neither JPEG nor PNG data")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if _is_complete(data) else None
+    if image is None:
+        raise MessageError(f"compressed image with format '{image_format}' ({len(data)} bytes) is truncated or damaged")
+    return image
+
+
+def _is_complete(data: bytes) -> bool:
+    """Whether the end marker follows the start of the pixels; decoders fill what is missing with grey."""
+    end, start = (b'\xff\xd9', b'\xff\xda') if data.startswith(_JPEG) else (b'IEND', b'IDAT')
+    return data.rfind(end) > data.find(start) > 0 and data.rfind(end) > data.rfind(start)
+
+
+def compressed_color_message(
+    factory: MessageFactory,
+    rgb: Rgb,
+    stamp_ns: int,
+    frame_id: str,
+    format: Literal['jpeg', 'png'] = 'jpeg',
+    jpeg_quality: int = 95,
+) -> Any:
+    """A ``sensor_msgs/CompressedImage`` of [H, W, 3] uint8 RGB, as image_transport's compressed plugin writes it.
+
+    Raises:
+        MessageError: the image has another shape or type, or the format is neither jpeg nor png.
+    """
+    if format not in ('jpeg', 'png'):
+        raise MessageError(f"compressed colour format '{format}' must be jpeg or png")
+    options = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if format == 'jpeg' else []
+    _, data = cv2.imencode(f'.{format}', cv2.cvtColor(checked_rgb(rgb), cv2.COLOR_RGB2BGR), options)
+    return _message(factory, stamp_ns, frame_id, f'rgb8; {format} compressed bgr8', data)
+
+
+def compressed_depth_message(
+    factory: MessageFactory,
+    depth_m: Depth,
+    stamp_ns: int,
+    frame_id: str,
+    encoding: Literal['16UC1', '32FC1'] = '16UC1',
+) -> Any:
+    """A ``sensor_msgs/CompressedImage`` of [H, W] metres, as image_transport's compressedDepth plugin writes it.
+
+    16UC1 rounds to whole millimetres (beyond 65.535 m: no reading). 32FC1 stores inverse depth, finest at
+    the nearest reading ``z0``: the rounding error at depth ``z`` is at most ``z**2 / (131070 z0)``.
+
+    Raises:
+        MessageError: the image has another shape or type, or the encoding is neither of the two.
+    """
+    depth_m = clean_metres(checked_depth(depth_m))
+    if encoding == '16UC1':
+        a, counts = 0.0, millimetres(depth_m)
+    elif encoding == '32FC1':
+        a, counts = _inverse_counts(depth_m)
+    else:
+        raise MessageError(f"compressed depth encoding '{encoding}' must be 16UC1 or 32FC1")
+    _, png = cv2.imencode('.png', counts)
+    data = np.concatenate([np.frombuffer(_CONFIG.pack(0, a, 0.0), np.uint8), png.reshape(-1)])
+    return _message(factory, stamp_ns, frame_id, f'{encoding}; compressedDepth png', data)
+
+
+def _inverse_counts(depth_m: Depth) -> tuple[float, NDArray[np.uint16]]:
+    """A and [H, W] counts with ``metres = A / count``; the nearest reading gets the largest count."""
+    is_reading = depth_m > 0
+    if not is_reading.any():
+        return 0.0, np.zeros(depth_m.shape, np.uint16)
+    a = float(np.float32(_LARGEST_COUNT * float(depth_m[is_reading].min())))
+    inverse = np.divide(a, depth_m, out=np.zeros(depth_m.shape), where=is_reading)
+    return a, np.minimum(np.rint(inverse), _LARGEST_COUNT).astype(np.uint16)
+
+
+def _message(factory: MessageFactory, stamp_ns: int, frame_id: str, image_format: str, data: NDArray[np.uint8]) -> Any:
+    return factory.make(
+        'sensor_msgs/msg/CompressedImage',
+        header=stamps.header(factory, stamp_ns, frame_id),
+        format=image_format,
+        data=data.reshape(-1),
+    )

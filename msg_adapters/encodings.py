@@ -1,0 +1,127 @@
+"""The encodings of ``sensor_msgs/Image`` that are understood, and the pixels of such a message."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from msg_adapters.errors import MessageError
+
+Rgb = NDArray[np.uint8]
+Depth = NDArray[np.float32]
+MILLIMETRES_PER_METRE = np.float32(1000)
+
+
+@dataclass(frozen=True, slots=True)
+class Encoding:
+    """How a pixel is stored, and what it is turned into.
+
+    Attributes:
+        dtype: type of one channel, without byte order.
+        channels: channels of a pixel.
+        convert: native [H, W] or [H, W, channels] pixels to RGB or metres; its result is a new array.
+        width_multiple: widths must be a multiple of this (pixels that share their colour).
+    """
+
+    dtype: str
+    channels: int
+    convert: Callable[[NDArray[Any]], NDArray[Any]]
+    width_multiple: int = 1
+
+
+def metres_from_millimetres(depth_mm: NDArray[np.uint16]) -> Depth:
+    """[H, W] metres of whole millimetres; 0 stays 0, no reading."""
+    return depth_mm.astype(np.float32) / MILLIMETRES_PER_METRE
+
+
+def clean_metres(depth_m: NDArray[np.floating[Any]]) -> Depth:
+    """A copy with 0 wherever there is no reading: NaN, inf, negative."""
+    with np.errstate(over='ignore'):  # beyond float32 is inf, and no reading either
+        depth_m = depth_m.astype(np.float32, copy=False)
+    return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(0))
+
+
+def _converted(code: int, image: Rgb) -> Rgb:
+    return cv2.cvtColor(image, code)
+
+
+def _color(channels: int, code: int, width_multiple: int = 1) -> Encoding:
+    return Encoding('u1', channels, partial(_converted, code), width_multiple)
+
+
+COLOR: Mapping[str, Encoding] = {
+    'rgb8': Encoding('u1', 3, np.copy),
+    'bgr8': _color(3, cv2.COLOR_BGR2RGB),
+    'rgba8': _color(4, cv2.COLOR_RGBA2RGB),
+    'bgra8': _color(4, cv2.COLOR_BGRA2RGB),
+    'mono8': _color(1, cv2.COLOR_GRAY2RGB),
+    # ROS names the first pixels of the first two rows, OpenCV's old names those of the second row and column.
+    'bayer_rggb8': _color(1, cv2.COLOR_BayerBG2RGB),
+    'bayer_bggr8': _color(1, cv2.COLOR_BayerRG2RGB),
+    'bayer_gbrg8': _color(1, cv2.COLOR_BayerGR2RGB),
+    'bayer_grbg8': _color(1, cv2.COLOR_BayerGB2RGB),
+    'yuv422': _color(2, cv2.COLOR_YUV2RGB_UYVY, width_multiple=2),
+    'uyvy': _color(2, cv2.COLOR_YUV2RGB_UYVY, width_multiple=2),
+    'yuv422_yuy2': _color(2, cv2.COLOR_YUV2RGB_YUY2, width_multiple=2),
+    'yuyv': _color(2, cv2.COLOR_YUV2RGB_YUY2, width_multiple=2),
+}
+
+DEPTH: Mapping[str, Encoding] = {
+    '16UC1': Encoding('u2', 1, metres_from_millimetres),
+    'mono16': Encoding('u2', 1, metres_from_millimetres),
+    '32FC1': Encoding('f4', 1, clean_metres),
+}
+
+
+def decode(message: Any, encodings: Mapping[str, Encoding], what: str) -> NDArray[Any]:
+    """Decode a ``sensor_msgs/Image`` whose encoding is one of those given.
+
+    Args:
+        message: the image.
+        encodings: what is understood.
+        what: 'colour' or 'depth', for the error.
+
+    Raises:
+        MessageError: the encoding is none of them, or size, step and data do not agree.
+    """
+    encoding = encodings.get(message.encoding)
+    if encoding is None:
+        raise MessageError(
+            f"{what} image has encoding '{message.encoding}'; supported are {', '.join(encodings)}; "
+            f'is this the {what} topic?'
+        )
+    return encoding.convert(_pixels(message, encoding))
+
+
+def _pixels(message: Any, encoding: Encoding) -> NDArray[Any]:
+    """[H, W] or [H, W, channels] in native byte order, without the padding at the end of rows."""
+    dtype = np.dtype(encoding.dtype).newbyteorder('>' if message.is_bigendian else '<')
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    row_bytes = width * encoding.channels * dtype.itemsize
+    data = np.frombuffer(message.data, np.uint8)
+    _check_layout(message, encoding, row_bytes, data.size)
+    rows = np.ascontiguousarray(data.reshape(height, step)[:, :row_bytes]).view(dtype)
+    pixels = rows.astype(dtype.newbyteorder('='), copy=False)
+    return pixels if encoding.channels == 1 else pixels.reshape(height, width, encoding.channels)
+
+
+def _check_layout(message: Any, encoding: Encoding, row_bytes: int, num_bytes: int) -> None:
+    height, width, step = message.height, message.width, message.step
+    name = f'{width}x{height} {message.encoding} image'
+    if height < 1 or width < 1:
+        raise MessageError(f'{name}: both sides must be at least 1 pixel')
+    if width % encoding.width_multiple:
+        raise MessageError(f'{name}: the width must be a multiple of {encoding.width_multiple} in this encoding')
+    if step < row_bytes:
+        raise MessageError(f'{name}: step is {step} bytes, but a row has {row_bytes}; the driver fills step wrongly')
+    if num_bytes != height * step:
+        raise MessageError(
+            f'{name}: data has {num_bytes} bytes, but {height} rows of {step} are {height * step}; '
+            'the image is truncated or the driver describes it wrongly'
+        )

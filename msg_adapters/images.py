@@ -1,0 +1,114 @@
+"""Images to and from ``sensor_msgs/Image`` and ``sensor_msgs/CompressedImage``.
+
+Colour is [H, W, 3] uint8 RGB, depth [H, W] float32 metres with 0 = no reading; NaN, inf and negative depths
+never come out of here.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msg_adapters import compressed, encodings, stamps
+from msg_adapters.compressed import compressed_color_message, compressed_depth_message
+from msg_adapters.encodings import Depth, Rgb
+from msg_adapters.errors import MessageError
+from msg_adapters.factory import MessageFactory
+from msg_adapters.pixels import checked_depth, checked_mono, checked_rgb, millimetres
+
+__all__ = [
+    'color_message',
+    'compressed_color_message',
+    'compressed_depth_message',
+    'decode_color',
+    'decode_depth',
+    'depth_message',
+    'mono_message',
+]
+
+
+def decode_color(message: Any) -> Rgb:
+    """[H, W, 3] uint8 RGB, contiguous, of an Image or CompressedImage; a copy, not a view of the message.
+
+    Raises:
+        MessageError: the encoding or format is not a supported colour one, or the data do not fit it.
+    """
+    if _is_raw(message):
+        return encodings.decode(message, encodings.COLOR, 'colour')
+    return compressed.decode_color(message)
+
+
+def decode_depth(message: Any) -> Depth:
+    """[H, W] float32 metres, 0 = no reading, of an Image or CompressedImage; a copy, not a view of the message.
+
+    16UC1 and mono16 are millimetres, 32FC1 metres (REP 118).
+
+    Raises:
+        MessageError: the encoding or format is not a supported depth one, or the data do not fit it.
+    """
+    if _is_raw(message):
+        return encodings.decode(message, encodings.DEPTH, 'depth')
+    return compressed.decode_depth(message)
+
+
+def _is_raw(message: Any) -> bool:
+    """Image and CompressedImage have no common class between rclpy and rosbags, but only one has an encoding."""
+    return hasattr(message, 'encoding')
+
+
+def color_message(factory: MessageFactory, rgb: Rgb, stamp_ns: int, frame_id: str) -> Any:
+    """An rgb8 ``sensor_msgs/Image`` of [H, W, 3] uint8.
+
+    Raises:
+        MessageError: the image has another shape or type.
+    """
+    return _image(factory, checked_rgb(rgb), 'rgb8', stamp_ns, frame_id)
+
+
+def mono_message(factory: MessageFactory, image: NDArray[np.uint8], stamp_ns: int, frame_id: str) -> Any:
+    """A mono8 ``sensor_msgs/Image`` of [H, W] uint8.
+
+    Raises:
+        MessageError: the image has another shape or type.
+    """
+    return _image(factory, checked_mono(image), 'mono8', stamp_ns, frame_id)
+
+
+def depth_message(
+    factory: MessageFactory,
+    depth_m: Depth,
+    stamp_ns: int,
+    frame_id: str,
+    encoding: Literal['32FC1', '16UC1'] = '32FC1',
+) -> Any:
+    """A depth ``sensor_msgs/Image`` of [H, W] metres, 0 = no reading.
+
+    32FC1 keeps every value; 16UC1 rounds to whole millimetres (beyond 65.535 m: no reading).
+
+    Raises:
+        MessageError: the image has another shape or type, or the encoding is neither of the two.
+    """
+    depth_m = encodings.clean_metres(checked_depth(depth_m))
+    if encoding == '32FC1':
+        return _image(factory, depth_m, encoding, stamp_ns, frame_id)
+    if encoding == '16UC1':
+        return _image(factory, millimetres(depth_m), encoding, stamp_ns, frame_id)
+    raise MessageError(f"depth encoding '{encoding}' must be 32FC1 or 16UC1")
+
+
+def _image(factory: MessageFactory, pixels: NDArray[Any], encoding: str, stamp_ns: int, frame_id: str) -> Any:
+    """An unpadded little-endian image of contiguous or other [H, W, ...] pixels."""
+    little_endian = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder('<'))
+    height, width = pixels.shape[:2]
+    return factory.make(
+        'sensor_msgs/msg/Image',
+        header=stamps.header(factory, stamp_ns, frame_id),
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=0,
+        step=little_endian.nbytes // height,
+        data=little_endian.reshape(-1).view(np.uint8),
+    )

@@ -1,0 +1,42 @@
+"""Checks and conversions of arrays on their way into image messages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msg_adapters.encodings import MILLIMETRES_PER_METRE, Depth, Rgb
+from msg_adapters.errors import MessageError
+
+
+def checked_rgb(image: NDArray[Any]) -> Rgb:
+    """The image, if it is [H, W, 3] uint8."""
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
+        raise _wrong('colour image', image, '[H, W, 3] uint8')
+    return image
+
+
+def checked_mono(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """The image, if it is [H, W] uint8."""
+    if image.ndim != 2 or image.dtype != np.uint8 or not image.size:
+        raise _wrong('mono image', image, '[H, W] uint8')
+    return image
+
+
+def checked_depth(image: NDArray[Any]) -> NDArray[np.floating[Any]]:
+    """The image, if it is [H, W] floating-point metres."""
+    if image.ndim != 2 or image.dtype.kind != 'f' or not image.size:
+        raise _wrong('depth image', image, '[H, W] float32 metres')
+    return image
+
+
+def millimetres(depth_m: Depth) -> NDArray[np.uint16]:
+    """[H, W] whole millimetres of clean metres; what 16 bits cannot hold becomes 0, no reading."""
+    depth_mm = np.rint(depth_m * MILLIMETRES_PER_METRE)
+    return np.where(depth_mm < 2**16, depth_mm, 0).astype(np.uint16)
+
+
+def _wrong(name: str, image: NDArray[Any], expected: str) -> MessageError:
+    return MessageError(f'{name} has shape {image.shape} and type {image.dtype}; expected {expected}')

@@ -1,0 +1,108 @@
+"""Poses as [4, 4] matrices, to and from geometry_msgs and nav_msgs. Quaternions here are x, y, z, w."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msg_adapters import stamps
+from msg_adapters.errors import MessageError
+from msg_adapters.factory import MessageFactory
+
+Matrix = NDArray[np.float64]
+
+
+def pose_matrix(pose: Any) -> Matrix:
+    """[4, 4] of a ``geometry_msgs/Pose``; its quaternion may have any length but zero.
+
+    Raises:
+        MessageError: a number is not finite, or the quaternion is zero.
+    """
+    p, q = pose.position, pose.orientation
+    xyzw = np.array([q.x, q.y, q.z, q.w], dtype=np.float64)
+    T = np.eye(4)
+    T[:3, 3] = p.x, p.y, p.z
+    length = np.linalg.norm(xyzw)
+    if not (np.isfinite(T).all() and np.isfinite(length) and length > 0):
+        raise MessageError(
+            f'pose with position {T[:3, 3].tolist()} and quaternion xyzw {xyzw.tolist()}: '
+            'all must be finite, and the quaternion not zero'
+        )
+    T[:3, :3] = _rotation(xyzw / length)
+    return T
+
+
+def pose_message(factory: MessageFactory, T: Matrix) -> Any:
+    """A ``geometry_msgs/Pose`` of a [4, 4] rigid motion; the quaternion has w >= 0."""
+    x, y, z, w = quaternion_xyzw(T[:3, :3])
+    return factory.make(
+        'geometry_msgs/msg/Pose',
+        position=factory.make('geometry_msgs/msg/Point', x=float(T[0, 3]), y=float(T[1, 3]), z=float(T[2, 3])),
+        orientation=factory.make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w),
+    )
+
+
+def pose_stamped(factory: MessageFactory, T: Matrix, stamp_ns: int, frame_id: str) -> Any:
+    """A ``geometry_msgs/PoseStamped`` of a [4, 4] pose in ``frame_id``."""
+    return factory.make(
+        'geometry_msgs/msg/PoseStamped',
+        header=stamps.header(factory, stamp_ns, frame_id),
+        pose=pose_message(factory, T),
+    )
+
+
+def odometry(factory: MessageFactory, T: Matrix, stamp_ns: int, frame_id: str, child_frame_id: str) -> Any:
+    """A ``nav_msgs/Odometry`` of the [4, 4] pose of ``child_frame_id`` in ``frame_id``; no twist, no covariances."""
+    unknown = np.zeros(36)
+    still = [factory.make('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0) for _ in range(2)]
+    twist = factory.make('geometry_msgs/msg/Twist', linear=still[0], angular=still[1])
+    return factory.make(
+        'nav_msgs/msg/Odometry',
+        header=stamps.header(factory, stamp_ns, frame_id),
+        child_frame_id=child_frame_id,
+        pose=factory.make('geometry_msgs/msg/PoseWithCovariance', pose=pose_message(factory, T), covariance=unknown),
+        twist=factory.make('geometry_msgs/msg/TwistWithCovariance', twist=twist, covariance=unknown),
+    )
+
+
+def path(factory: MessageFactory, trajectory: Sequence[tuple[int, Matrix]], stamp_ns: int, frame_id: str) -> Any:
+    """A ``nav_msgs/Path`` of (stamp_ns, [4, 4]) poses, each with its own stamp."""
+    return factory.make(
+        'nav_msgs/msg/Path',
+        header=stamps.header(factory, stamp_ns, frame_id),
+        poses=[pose_stamped(factory, T, pose_stamp_ns, frame_id) for pose_stamp_ns, T in trajectory],
+    )
+
+
+def quaternion_xyzw(R: Matrix) -> tuple[float, float, float, float]:
+    """Unit quaternion with w >= 0 of a [3, 3] rotation.
+
+    The eigenvector of Bar-Itzhack's symmetric matrix with the largest eigenvalue: as exact for half
+    turns as for none, and the closest rotation where R is a little off (Bar-Itzhack 2000, version 3).
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.asarray(R, dtype=np.float64)
+    lower = np.array(
+        [
+            [xx - yy - zz, 0, 0, 0],
+            [yx + xy, yy - xx - zz, 0, 0],
+            [zx + xz, zy + yz, zz - xx - yy, 0],
+            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
+        ]
+    )
+    q = np.linalg.eigh(lower, UPLO='L')[1][:, -1]
+    x, y, z, w = (q if q[3] >= 0 else -q).tolist()
+    return x, y, z, w
+
+
+def _rotation(xyzw: Matrix) -> Matrix:
+    x, y, z, w = xyzw
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
