@@ -1,0 +1,82 @@
+"""The table of readers, and opening a recording without being told its format."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+
+from splatam_core.datasets.base import BagTopics, Format, ReadOptions, Sequence, cut
+from splatam_core.errors import DatasetError
+
+READERS = {
+    'synthetic': 'splatam_core.datasets.synthetic',
+    'tum': 'splatam_core.datasets.tum',
+    'sevenscenes': 'splatam_core.datasets.sevenscenes',
+    'rosbag': 'splatam_core.datasets.rosbag',
+}
+"""Format name to module. A module holds its row as ``FORMAT`` and is imported when it is looked at."""
+
+
+def open_sequence(
+    source: str,
+    *,
+    format: str | None = None,
+    width: int | None = None,
+    start: int = 0,
+    max_frames: int | None = None,
+    topics: BagTopics | None = None,
+) -> Sequence:
+    """Open a recording.
+
+    Args:
+        source: a dataset folder, a rosbag2 (folder, ``.db3``, ``.mcap``), or ``synthetic[:options]``.
+        format: one of ``READERS``; guessed from the source when None.
+        width: width of the frames in pixels; None keeps the recorded size.
+        start: index of the first frame.
+        max_frames: how many frames at most.
+        topics: which topics of a bag to read; those left None are found by type.
+
+    Raises:
+        DatasetError: the source is of no known format, is broken, or has no such frames.
+        CameraError: its camera cannot be used.
+    """
+    options = ReadOptions(width, start, max_frames, topics or BagTopics())
+    reader = _reader(format) if format is not None else _guess(source)
+    if reader.name != 'synthetic' and not Path(source).exists():
+        raise DatasetError(f'{source}: there is no such file or folder')
+    if reader.name != 'rosbag' and options.topics != BagTopics():
+        raise DatasetError(f'{source}: is read as {reader.name}, where there are no topics to choose; leave them out')
+    return cut(reader.open(source, options), options)
+
+
+def _reader(name: str) -> Format:
+    if name not in READERS:
+        raise DatasetError(f"format '{name}' is not one of {', '.join(READERS)}")
+    return import_module(READERS[name]).FORMAT
+
+
+def _guess(source: str) -> Format:
+    fitting = []
+    for name in READERS:
+        reader = _reader(name)
+        if reader.recognises(source):
+            fitting.append(reader)
+    if len(fitting) == 1:
+        return fitting[0]
+    if fitting:
+        names = ' and '.join(reader.name for reader in fitting)
+        raise DatasetError(f'{source}: looks like {names} at once; choose one with --format')
+    expected = '; '.join(f'{name}: {_reader(name).expects}' for name in READERS)
+    raise DatasetError(f'{source}: {_found(Path(source))}. A recording is one of {expected}')
+
+
+def _found(path: Path, at_most: int = 6) -> str:
+    if not path.exists():
+        return 'there is no such file or folder'
+    if not path.is_dir():
+        return f"is a '{path.suffix}' file" if path.suffix else 'is a file without a suffix'
+    names = sorted(entry.name for entry in path.iterdir())
+    if not names:
+        return 'is an empty folder'
+    more = f' and {len(names) - at_most} more' if len(names) > at_most else ''
+    return f'holds {", ".join(names[:at_most])}{more}'

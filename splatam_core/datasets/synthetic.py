@@ -1,0 +1,180 @@
+"""A synthetic room, seen by a hand-held RGB-D camera whose poses are known exactly.
+
+SOURCE is ``synthetic``, or ``synthetic:`` and options with commas between::
+
+    synthetic:seed=3,noise=off,frames=600
+
+``seed``
+    Which room and which walk through it (default 0). Frame i of a seed is the same whatever else is
+    asked for.
+``noise``
+    ``on`` (default): depth is measured as by a Kinect, in whole millimetres. ``off``: exact depth.
+``frames``
+    Length (default: as far as ``--max-frames`` asks, else 300). The walk closes its loop every 300
+    frames and then goes on along nearly the same way.
+
+Frames are 640x480 unless ``--width`` says otherwise, which renders at that size instead of resizing.
+There is no motion blur and no noise in the colours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatam_core.camera import CameraCalibration, FrameFactory, PinholeCamera
+from splatam_core.datasets import base
+from splatam_core.datasets.room import build_room, look_at
+from splatam_core.errors import DatasetError
+from splatam_core.types import RgbdFrame, Trajectory
+
+CAMERA = PinholeCamera(640, 480, 525.0, 525.0, 319.5, 239.5)
+LOOP_FRAMES = 300
+SCHEME = 'synthetic'
+
+
+class SyntheticSequence:
+    """As many frames as asked of one walk through one room."""
+
+    def __init__(self, *, seed: int = 0, noise: bool = True, frames: int = LOOP_FRAMES, width: int | None = None) -> None:
+        self.name = f'{SCHEME}_{seed}'
+        self.camera = FrameFactory(CameraCalibration(CAMERA), width).camera
+        self.depth_scale: float | None = 1000.0 if noise else None
+        self._seed = seed
+        self._frames = range(frames)
+        self._walk = Walk.of(seed)
+        self._room = build_room(seed)
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, index: int) -> RgbdFrame:
+        """Render one frame."""
+        frame = self._frames[index]
+        T_world_cam = self._walk.pose(frame)
+        cast = self._room.cast(self.camera, T_world_cam)
+        depth_m = cast.depth_m
+        if self.depth_scale is not None:
+            incidence = self._room.incidence(self.camera, T_world_cam, cast)
+            depth_m = measured(depth_m, incidence, np.random.default_rng([self._seed, 2, frame]))
+        rgb = self._room.color(self.camera, T_world_cam)
+        return RgbdFrame(base.nominal_stamp_ns(frame), rgb, depth_m, self.camera)
+
+    def ground_truth(self) -> Trajectory:
+        """The pose of every frame, in the room's axes (z up)."""
+        stamps = np.array([base.nominal_stamp_ns(frame) for frame in self._frames], np.int64)
+        return Trajectory(stamps, np.stack([self._walk.pose(frame) for frame in self._frames]))
+
+
+@dataclass(frozen=True, eq=False)
+class Walk:
+    """A hand-held camera's way: one loop through the room that looks around, and a hand that is never still.
+
+    Attributes:
+        phases: [4] radians, where on its way the camera begins.
+        tremor_hz: [6, 3] frequencies of the hand's motion along x, y, z and about yaw, pitch, roll.
+        tremor_phases: [6, 3] radians.
+    """
+
+    phases: NDArray[np.float64]
+    tremor_hz: NDArray[np.float64]
+    tremor_phases: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, seed: int) -> Walk:
+        """The walk of a seed."""
+        rng = np.random.default_rng([seed, 0])
+        turn = 2 * np.pi
+        return cls(rng.uniform(0, turn, 4), rng.uniform(0.4, 2.2, (6, 3)), rng.uniform(0, turn, (6, 3)))
+
+    def pose(self, frame: int) -> NDArray[np.float64]:
+        """[4, 4] camera to world. At most about 0.35 m/s and 25 degrees/s."""
+        around = 2 * np.pi * frame / LOOP_FRAMES + self.phases
+        seconds = frame / base.NOMINAL_RATE_HZ
+        tremor = np.sin(2 * np.pi * self.tremor_hz * seconds + self.tremor_phases).mean(axis=1)
+        eye = np.array([0.1 + 0.45 * np.cos(around[0]), -0.4 + 0.3 * np.sin(around[0]), 1.4 + 0.08 * np.sin(around[1])])
+        yaw = 0.6 * np.sin(around[2]) + 0.006 * tremor[3]
+        pitch = -0.24 + 0.12 * np.sin(around[3]) + 0.006 * tremor[4]
+        forward = np.array([np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), np.sin(pitch)])
+        eye = eye + 0.006 * tremor[:3]
+        return look_at(eye, eye + forward, 0.03 * np.sin(around[1]) + 0.006 * tremor[5])
+
+
+def measured(
+    depth_m: NDArray[np.float32], incidence: NDArray[np.float32], rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Depth as a structured-light camera measures it.
+
+    The error along the axis grows with the square of the depth (Khoshelham and Elberink 2012, 1.4 mm
+    at 1 m). There is no reading out of range, on surfaces seen at a grazing angle, and on most pixels
+    at depth edges, where the pattern is in shadow. Readings are whole millimetres.
+
+    Args:
+        depth_m: [H, W] true depth.
+        incidence: [H, W] cosine between ray and surface normal.
+        rng: decides the errors.
+
+    Returns:
+        [H, W] metres, 0 = no reading.
+    """
+    error_m = 1.425e-3 * depth_m**2 * rng.standard_normal(depth_m.shape, dtype=np.float32)
+    chance = rng.random(depth_m.shape, dtype=np.float32)
+    lost = (depth_m < 0.4) | (depth_m > 5.0)
+    lost |= chance < (0.21 - incidence) / 0.12  # none below 78 degrees, all from 85 on
+    lost |= _depth_edges(depth_m) & (chance < 0.7)
+    millimetres = np.rint(1000 * (depth_m + error_m)).astype(np.uint16)
+    return base.metres(np.where(lost, np.uint16(0), millimetres), 1000.0)
+
+
+def _depth_edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Pixels with a neighbour that is more than 4 % nearer or farther."""
+    edges = np.zeros(depth_m.shape, bool)
+    for axis in (0, 1):
+        jump = np.abs(np.diff(np.log(depth_m), axis=axis)) > 0.04
+        before, after = [slice(None)] * 2, [slice(None)] * 2
+        before[axis], after[axis] = slice(None, -1), slice(1, None)
+        edges[tuple(before)] |= jump
+        edges[tuple(after)] |= jump
+    return edges
+
+
+def _recognises(source: str) -> bool:
+    return source == SCHEME or source.startswith(f'{SCHEME}:')
+
+
+def _open(source: str, options: base.ReadOptions) -> SyntheticSequence:
+    given = _parse(source)
+    asked = LOOP_FRAMES if options.max_frames is None else options.start + options.max_frames
+    return SyntheticSequence(
+        seed=_integer('seed', given.get('seed', '0'), 0),
+        noise=_switch('noise', given.get('noise', 'on')),
+        frames=_integer('frames', given.get('frames', str(asked)), 1),
+        width=options.width,
+    )
+
+
+def _parse(source: str) -> dict[str, str]:
+    options: dict[str, str] = {}
+    for part in filter(None, source.removeprefix(SCHEME).removeprefix(':').split(',')):
+        key, _, value = part.partition('=')
+        if key not in ('seed', 'noise', 'frames'):
+            raise DatasetError(f"{source}: unknown option '{key}'; use seed=N, noise=on|off, frames=N")
+        options[key] = value
+    return options
+
+
+def _integer(key: str, text: str, minimum: int) -> int:
+    if not text.isascii() or not text.isdigit() or int(text) < minimum:
+        raise DatasetError(f"{SCHEME}: {key}='{text}' must be a whole number, at least {minimum}")
+    return int(text)
+
+
+def _switch(key: str, text: str) -> bool:
+    if text not in ('on', 'off'):
+        raise DatasetError(f"{SCHEME}: {key}='{text}' must be on or off")
+    return text == 'on'
+
+
+FORMAT = base.Format(SCHEME, f"'{SCHEME}' or '{SCHEME}:seed=N,noise=on|off,frames=N'", _recognises, _open)

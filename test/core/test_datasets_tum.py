@@ -1,0 +1,152 @@
+"""The TUM RGB-D reader, on folders made here and on the real recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splatam_core.datasets.registry import open_sequence
+from splatam_core.datasets.tum import KNOWN_CAMERAS, TumSequence, associate
+from splatam_core.errors import CameraError, DatasetError, FrameError
+
+CAMERA_YAML = 'width: 64\nheight: 48\nfx: 50\nfy: 51\ncx: 31.5\ncy: 23.5\n'
+BASE = 1305031000
+
+
+def write_tum(folder: Path, rgb_s: list[float], depth_s: list[float], *, camera: str | None = CAMERA_YAML) -> Path:
+    """A folder of 64x48 images: colour image i is all (10 i, 20, 30), depth image j is all 5000 + 50 j counts."""
+    for name in ('rgb', 'depth'):
+        (folder / name).mkdir(parents=True)
+    lists = {'rgb': ['# color images', '# timestamp filename'], 'depth': ['# depth maps', '']}
+    for i, seconds in enumerate(rgb_s):
+        image = np.broadcast_to(np.uint8([30, 20, 10 * i]), (48, 64, 3))  # OpenCV's order: blue first
+        cv2.imwrite(str(folder / f'rgb/{i}.png'), image)
+        lists['rgb'].append(f'{BASE + seconds:.6f} rgb/{i}.png')
+    for j, seconds in enumerate(depth_s):
+        cv2.imwrite(str(folder / f'depth/{j}.png'), np.full((48, 64), 5000 + 50 * j, np.uint16))
+        lists['depth'].append(f'{BASE + seconds:.6f} depth/{j}.png')
+    for name, lines in lists.items():
+        (folder / f'{name}.txt').write_text('\n'.join(lines) + '\n')
+    if camera is not None:
+        (folder / 'camera.yaml').write_text(camera)
+    return folder
+
+
+def test_frames_have_colour_stamp_rgb_order_and_metres(tmp_path):
+    folder = write_tum(tmp_path / 'mine', [1.0, 1.033333, 1.066667], [1.01, 1.04, 1.07])
+    sequence = open_sequence(str(folder))
+    frame = sequence[2]
+    assert len(sequence) == 3
+    assert sequence.name == 'mine'
+    assert frame.stamp_ns == BASE * 10**9 + 1_066_667_000  # exact: the text is decimal, not a float
+    assert frame.rgb[5, 7].tolist() == [20, 20, 30]
+    assert np.all(frame.depth_m == np.float32(5100) / np.float32(5000))
+    assert frame.depth_m.dtype == np.float32
+    assert (sequence.camera.width, sequence.camera.fx, sequence.depth_scale) == (64, 50.0, 5000.0)
+    assert sequence.ground_truth() is None
+
+
+def test_each_depth_is_used_once_by_the_nearest_colour(tmp_path):
+    # colour 0 and 1 both have depth 0 within reach; 1 is nearer. Colour 2 has none within 20 ms.
+    folder = write_tum(tmp_path, [1.0, 1.01, 1.2], [1.012, 1.3])
+    sequence = TumSequence(folder)
+    assert [sequence[i].rgb[0, 0, 0] for i in range(len(sequence))] == [10]
+
+
+def test_associate_takes_second_best_when_the_best_is_taken():
+    a, b = np.array([0, 10, 100]), np.array([9, 25])
+    assert associate(a, b, 20) == [(1, 0)]  # 0 would reach 9 only, which is 10's
+    assert associate(a, b, 30) == [(0, 1), (1, 0)]
+
+
+@pytest.mark.parametrize(('interval', 'pairs'), [(20, [(0, 0)]), (19, [])])
+def test_associate_limit_is_inclusive(interval, pairs):
+    assert associate(np.array([0]), np.array([20]), interval) == pairs
+
+
+def test_nothing_pairs(tmp_path):
+    with pytest.raises(DatasetError, match='none of 1 colour and 1 depth images are within 20 ms'):
+        TumSequence(write_tum(tmp_path, [1.0], [2.0]))
+
+
+@pytest.mark.parametrize(
+    ('name', 'number'),
+    [('rgbd_dataset_freiburg1_xyz', '1'), ('rgbd_dataset_freiburg2_desk', '2'), ('tum_fr3_office', '3')],
+)
+def test_known_camera_by_folder_name(tmp_path, name, number):
+    sequence = TumSequence(write_tum(tmp_path / name, [1.0], [1.0], camera=None))
+    assert sequence.camera == KNOWN_CAMERAS[number].pinhole
+    with pytest.raises(FrameError, match='colour image is 64x48 but the camera is calibrated for 640x480'):
+        sequence[0]
+
+
+def test_camera_yaml_wins_over_folder_name(tmp_path):
+    folder = write_tum(tmp_path / 'freiburg1', [1.0], [1.0], camera=CAMERA_YAML + 'depth_scale: 1000\n')
+    sequence = TumSequence(folder)
+    assert sequence.camera.fx == 50.0
+    assert sequence.depth_scale == 1000.0
+    assert np.all(sequence[0].depth_m == 5.0)
+
+
+@pytest.mark.parametrize('name', ['mine', 'fr10_hall', 'afr1'])
+def test_unknown_camera_says_what_to_do(tmp_path, name):
+    with pytest.raises(DatasetError, match=r'camera is unknown.*put a camera\.yaml'):
+        TumSequence(write_tum(tmp_path / name, [1.0], [1.0], camera=None))
+
+
+def test_broken_camera_yaml(tmp_path):
+    with pytest.raises(CameraError, match=r'camera\.yaml: missing cx, cy, fy'):
+        TumSequence(write_tum(tmp_path, [1.0], [1.0], camera='width: 64\nheight: 48\nfx: 50\n'))
+
+
+@pytest.mark.parametrize(
+    ('line', 'message'),
+    [
+        ('abc rgb/0.png', r"rgb\.txt:1: expected 'stamp path', got 'abc rgb/0\.png'"),
+        ('1.5', r"rgb\.txt:1: expected 'stamp path'"),
+        ('2.0 rgb/0.png\n1.0 rgb/1.png', 'stamps must increase, but 1.000000000 follows 2.000000000'),
+    ],
+)
+def test_broken_list(tmp_path, line, message):
+    folder = write_tum(tmp_path, [1.0], [1.0])
+    (folder / 'rgb.txt').write_text(line)
+    with pytest.raises(DatasetError, match=message):
+        TumSequence(folder)
+
+
+def test_missing_and_broken_images_say_which(tmp_path):
+    folder = write_tum(tmp_path, [1.0, 2.0, 3.0], [1.0, 2.0, 3.0])
+    (folder / 'rgb/0.png').unlink()
+    (folder / 'rgb/1.png').write_bytes((folder / 'rgb/2.png').read_bytes()[:20])
+    cv2.imwrite(str(folder / 'depth/2.png'), np.zeros((48, 64, 3), np.uint8))
+    sequence = TumSequence(folder)
+    for index, message in enumerate([r'rgb/0\.png: cannot be read', r'rgb/1\.png: is not an image', '16 bits']):
+        with pytest.raises(DatasetError, match=message):
+            sequence[index]
+
+
+def test_broken_truth_is_an_error_not_a_missing_truth(tmp_path):
+    folder = write_tum(tmp_path, [1.0], [1.0])
+    (folder / 'groundtruth.txt').write_text('1.0 0 0 0\n')
+    with pytest.raises(DatasetError, match=r'groundtruth\.txt:1'):
+        TumSequence(folder).ground_truth()
+
+
+def test_real_recording(recording):
+    sequence = open_sequence(str(recording('tum_fr1_rpy')), width=320, max_frames=3)
+    frame, truth = sequence[1], sequence.ground_truth()
+    assert (frame.stamp_ns, frame.rgb.shape, frame.depth_m.shape) == (1305031235561675000, (240, 320, 3), (240, 320))
+    assert sequence.camera.fx == pytest.approx(517.306408 / 2)
+    assert 0.5 < (frame.depth_m > 0).mean() < 1.0
+    # 60 deg/s would turn the view by 2 degrees in a frame: truth must bracket the frames closely
+    assert truth.stamps_ns[0] < sequence[0].stamp_ns < truth.stamps_ns[-1]
+    assert len(truth) > 900
+
+
+def test_real_recording_is_the_known_camera(recording):
+    folder = recording('tum_fr1_rpy')
+    stated = KNOWN_CAMERAS['1']
+    assert TumSequence(folder).camera == stated.pinhole  # its camera.yaml states what the table states
