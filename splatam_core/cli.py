@@ -150,8 +150,8 @@ def _process(sequence: FrameSequence, slam: Slam, folder: RunFolder, stop: _Stop
     from tqdm import tqdm
 
     tracked = lost = 0
-    with tqdm(total=len(sequence), unit='frame', dynamic_ncols=True) as bar:
-        for index in range(len(sequence)):
+    with tqdm(range(len(sequence)), unit='frame', dynamic_ncols=True) as bar:
+        for index in bar:
             if stop.requested:
                 break
             started_s = time.perf_counter()
@@ -164,11 +164,9 @@ def _process(sequence: FrameSequence, slam: Slam, folder: RunFolder, stop: _Stop
                 continue
             except DatasetError as error:
                 return error
-            finally:
-                bar.update()
             folder.append(frame, result, time.perf_counter() - decoded_s, decoded_s - started_s)
             tracked, lost = tracked + (result.T_world_cam is not None), lost + (result.T_world_cam is None)
-            bar.set_postfix(tracked=tracked, lost=lost, gaussians=result.num_gaussians)
+            bar.set_postfix(tracked=tracked, lost=lost, gaussians=result.num_gaussians, refresh=False)
     return None
 
 
@@ -217,7 +215,7 @@ def _truth_and_frames(run: RunRecord, given: str | None) -> tuple[Trajectory | N
     truth = other.ground_truth()
     if truth is None:
         _say(f'{given} has no true poses: images only')
-    return truth, own or other
+    return truth, other if own is None else own
 
 
 def _open_own_source(run: RunRecord) -> FrameSequence | None:
@@ -238,17 +236,11 @@ def _score(run: RunRecord, truth: Trajectory | None, sequence: FrameSequence | N
     from splatam_core.run_folder import METRICS, REPORT
 
     against_truth = None if truth is None else score_trajectory(run, truth)
-    against_images = None if sequence is None else score_images(run, sequence, every, _score_progress)
+    against_images = None if sequence is None else score_images(run, sequence, every, _progress('scoring'))
     evaluation = combine(run, against_truth, against_images)
     replace_text(run.path / METRICS, evaluation.metrics.to_json())
     write_report(evaluation, run.path / REPORT)
     return evaluation.metrics
-
-
-def _score_progress(indices: range) -> Iterable[int]:
-    from tqdm import tqdm
-
-    return tqdm(indices, unit='frame', desc='scoring', dynamic_ncols=True, leave=False)
 
 
 # --- convert ---
@@ -266,7 +258,7 @@ def convert(args: argparse.Namespace) -> int:
     from splatam_core.datasets.convert import write_bag
 
     sequence = _open(_source(args))
-    write_bag(sequence, args.bag, storage=args.storage, compressed=args.compressed, progress=_convert_progress)
+    write_bag(sequence, args.bag, storage=args.storage, compressed=args.compressed, progress=_progress('writing'))
     print(f'{len(sequence)} frames of {sequence.name} are in {args.bag}')
     return 0
 
@@ -312,6 +304,13 @@ def _positive(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f'{value} is not at least 1')
     return value
+
+
+def _progress(what: str) -> Callable[[range], Iterable[int]]:
+    """Wraps a loop over frames in a progress bar that goes away when it is done."""
+    from tqdm import tqdm
+
+    return lambda indices: tqdm(indices, unit='frame', desc=what, dynamic_ncols=True, leave=False)
 
 
 def _say(text: str) -> None:
