@@ -1,0 +1,99 @@
+"""Messages in, frames out: pairs, decodes and rectifies what the camera sends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from msg_adapters import camera_info, images, stamps
+from msg_adapters.errors import MessageError
+from msg_adapters.synchronizer import RgbdSet, RgbdSynchronizer, SyncStatistics
+from splatam_core.camera import CameraCalibration, FrameFactory
+from splatam_core.errors import CameraError, FrameError
+from splatam_core.types import RgbdFrame
+from splatam_ros.parameters import NodeOptions
+from splatam_ros.warnings import ThrottledWarnings
+
+T = TypeVar('T')
+
+
+class Intake:
+    """Turns the three streams into frames. What cannot be used is left out with a warning; nothing raises."""
+
+    def __init__(self, options: NodeOptions, warnings: ThrottledWarnings) -> None:
+        self.camera_frame = ''
+        self._synchronizer = RgbdSynchronizer(
+            options.sync_mode, round(options.sync_max_interval * 1e9), options.sync_queue_size
+        )
+        self._width = options.width or None
+        self._warnings = warnings
+        self._factory: FrameFactory | None = None
+        self._reported = self._synchronizer.statistics
+
+    @property
+    def statistics(self) -> SyncStatistics:
+        """Where the messages went."""
+        return self._synchronizer.statistics
+
+    def color(self, message: Any) -> list[RgbdFrame]:
+        """Take a colour image; the frames it completes."""
+        return self._frames(self._synchronizer.add_color(stamps.message_stamp_ns(message), message))
+
+    def depth(self, message: Any) -> list[RgbdFrame]:
+        """Take a depth image; the frames it completes."""
+        return self._frames(self._synchronizer.add_depth(stamps.message_stamp_ns(message), message))
+
+    def info(self, message: Any) -> list[RgbdFrame]:
+        """Take a CameraInfo; the frames that waited for it."""
+        return self._frames(self._synchronizer.add_info(stamps.message_stamp_ns(message), message))
+
+    def flush(self) -> list[RgbdFrame]:
+        """The frames that can be made if nothing more comes; what has no partner is dropped."""
+        return self._frames(self._synchronizer.flush())
+
+    def report_drops(self) -> None:
+        """Warn of what the synchronizer has dropped since the last report."""
+        before, now = self._reported, self._synchronizer.statistics
+        self._reported = now
+        self._report('duplicates', now.duplicates - before.duplicates, 'with a stamp that was there already')
+        self._report('late', now.late - before.late, 'older than the last frame; do the stamps increase?')
+        self._report('unpaired colour', now.unpaired_color - before.unpaired_color, f'(colour) without depth{_gap(now)}')
+        self._report('unpaired depth', now.unpaired_depth - before.unpaired_depth, f'(depth) without colour{_gap(now)}')
+        self._report('without info', now.without_info - before.without_info, 'with depth, but no CameraInfo has come')
+
+    def _report(self, kind: str, count: int, what: str) -> None:
+        if count > 0:
+            self._warnings.warn(kind, f'{count} image{"s" if count > 1 else ""} dropped: {what}')
+
+    def _frames(self, sets: list[RgbdSet]) -> list[RgbdFrame]:
+        frames = [self._frame(found) for found in sets]
+        return [frame for frame in frames if frame is not None]
+
+    def _frame(self, found: RgbdSet) -> RgbdFrame | None:
+        factory = self._attempt('CameraInfo', self._frame_factory, found)
+        rgb = self._attempt('colour image', images.decode_color, found.color)
+        depth_m = self._attempt('depth image', images.decode_depth, found.depth)
+        if factory is None or rgb is None or depth_m is None:
+            return None
+        return self._attempt('frame', lambda _: factory.make(found.stamp_ns, rgb, depth_m), None)
+
+    def _frame_factory(self, found: RgbdSet) -> FrameFactory:
+        parameters = camera_info.parameters(found.info)
+        calibration = CameraCalibration.from_intrinsics(parameters)
+        if self._factory is None or self._factory.calibration != calibration:
+            self._factory = FrameFactory(calibration, self._width)
+        self.camera_frame = parameters.frame_id or found.color.header.frame_id
+        return self._factory
+
+    def _attempt(self, what: str, function: Callable[[Any], T], argument: Any) -> T | None:
+        try:
+            return function(argument)
+        except (MessageError, CameraError, FrameError) as error:
+            self._warnings.warn(what, f'frame left out: {what}: {error}')
+            return None
+
+
+def _gap(statistics: SyncStatistics) -> str:
+    if statistics.newest_gap_ns is None:
+        return ''
+    return f'; the newest depth is {statistics.newest_gap_ns / 1e9:+.3f} s from the newest colour'

@@ -1,0 +1,221 @@
+"""The node: parameters, subscriptions, the SLAM worker and what it publishes. Nothing slow runs in its callbacks."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from splatam_core.config import SlamConfig, apply_threads
+from splatam_core.errors import FrameError, SplatamError
+from splatam_core.run_folder import RunDescription, RunFolder
+from splatam_core.slam import Slam
+from splatam_core.trajectory import stamp_text
+from splatam_core.types import FrameResult, RgbdFrame, Status
+from splatam_core.worker import SlamWorker, WorkerStopped
+from splatam_ros import parameters
+from splatam_ros.diagnosis import why_no_frames
+from splatam_ros.inputs import Input
+from splatam_ros.intake import Intake
+from splatam_ros.outputs import Outputs
+from splatam_ros.warnings import ThrottledWarnings
+
+TICK_S = 0.2
+QUIET_S = 1.0  # without a message: what can be paired by then is paired, and publishers that left are gone
+LONG_QUIET_S = 10.0  # the same where one more partner is due; a paused player may be about to send it
+PROGRESS_S = 10.0
+TRANSPORTS = {
+    'raw': ('', Image),
+    'compressed': ('/compressed', CompressedImage),
+    'compressedDepth': ('/compressedDepth', CompressedImage),
+}
+
+
+class SplatamNode(Node):
+    """RGB-D images in; poses, renders and a Gaussian map out.
+
+    The executor's thread pairs and decodes; ``SlamWorker`` owns Slam, the run folder and the publishers.
+    """
+
+    def __init__(self) -> None:
+        """Declare the parameters and start everything.
+
+        Raises:
+            SplatamError: a parameter cannot be used, or there is no place to save to.
+        """
+        super().__init__('splatam', automatically_declare_parameters_from_overrides=True)
+        self.options, self.config = parameters.declare(self)
+        apply_threads(self.config)
+        self.is_finished = False
+        self._warnings = ThrottledWarnings(self.get_logger())
+        self._slam = Slam(self.config)
+        self._intake = Intake(self.options, self._warnings)
+        self._outputs = Outputs(self, self.options)
+        self._inputs = self._subscribe()
+        self._folder = self._create_folder()
+        self._counts = dict.fromkeys(Status, 0)
+        self._num_dropped = 0
+        self._heard_s = self._supplied_s = self._progress_s = time.monotonic()
+        self._had_publishers = self._has_told_why = False
+        self.create_timer(TICK_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        # Last, since a thread must be joined: nothing after this may fail.
+        self._worker = SlamWorker(
+            self._slam, self._on_result, self._on_bad_frame, queue_size=self.options.queue_size,
+            when_full='block' if self._keeps_all else 'drop_oldest',
+        )  # fmt: skip
+        self.get_logger().info(
+            f"preset '{self.options.preset}', waiting for {', '.join(item.topic for item in self._inputs)}, "
+            + (f'saving to {self._folder.path}' if self._folder else 'saving nothing: save_path is empty')
+        )
+
+    @property
+    def _keeps_all(self) -> bool:
+        return self.options.queue_policy == 'all'
+
+    def _create_folder(self) -> RunFolder | None:
+        if self.options.folder is None:
+            return None
+        description = RunDescription('splatam_node', self.options.preset)
+        return RunFolder.create(self.options.folder, self.config, description, overwrite=self.options.overwrite)
+
+    def _subscribe(self) -> list[Input]:
+        rgb_suffix, rgb_class = TRANSPORTS[self.options.rgb_transport]
+        depth_suffix, depth_class = TRANSPORTS[self.options.depth_transport]
+        streams = (
+            (rgb_class, f'rgb/image{rgb_suffix}', self._intake.color),
+            (depth_class, f'depth/image{depth_suffix}', self._intake.depth),
+            (CameraInfo, 'rgb/camera_info', self._intake.info),
+        )
+        return [
+            Input(
+                self, message_class, topic, self._handler(add),
+                reliability=self.options.input_reliability, keep_all=self._keeps_all,
+            )
+            for message_class, topic, add in streams
+        ]  # fmt: skip
+
+    # --- executor thread ---
+
+    def _handler(self, add: Callable[[Any], list[RgbdFrame]]) -> Callable[[Any], None]:
+        def handle(message: Any) -> None:
+            self._supply(add(message))
+            self._heard_s = time.monotonic()
+
+        return handle
+
+    def _supply(self, frames: list[RgbdFrame]) -> None:
+        for frame in frames:
+            try:
+                self._worker.submit(frame)
+            except WorkerStopped:  # why is said when the node closes
+                self.is_finished = True
+                return
+            self._supplied_s = time.monotonic()
+            self._has_told_why = False
+
+    def _tick(self) -> None:
+        quiet_s = time.monotonic() - self._heard_s
+        if self._worker.pending:
+            self._supplied_s = time.monotonic()
+        elif self._stalls_on_lookahead(quiet_s):
+            self._supply(self._intake.flush())
+        self._report_drops()
+        self._explain_silence()
+        self._check_end(quiet_s)
+
+    def _stalls_on_lookahead(self, quiet_s: float) -> bool:
+        """Whether images wait for a better partner that will not come: a player may be waiting for us."""
+        waiting = self._intake.statistics
+        if not (waiting.waiting_color and waiting.waiting_depth):
+            return False
+        return quiet_s > (QUIET_S if waiting.waiting_color == waiting.waiting_depth else LONG_QUIET_S)
+
+    def _report_drops(self) -> None:
+        self._intake.report_drops()
+        dropped = self._worker.dropped
+        if dropped > self._num_dropped:
+            self._warnings.warn(
+                'dropped', f'SLAM is slower than the camera: {dropped} frames dropped so far; '
+                'queue_policy all keeps every frame of a recording',
+            )  # fmt: skip
+        self._num_dropped = dropped
+
+    def _explain_silence(self) -> None:
+        timeout_s = self.options.no_data_timeout
+        if timeout_s and not self._has_told_why and time.monotonic() - self._supplied_s > timeout_s:
+            self._has_told_why = True
+            why = why_no_frames(self._inputs, self._intake.statistics, self.options)
+            self.get_logger().warning(f'no frame for {timeout_s:g} s: {why}')
+
+    def _check_end(self, quiet_s: float) -> None:
+        """Finish when a worker broke down, or the publishers have left and all of theirs is processed."""
+        has_publishers = any(item.num_publishers for item in self._inputs[:2])
+        self._had_publishers |= has_publishers
+        if self._worker.error is not None:
+            self.is_finished = True
+        elif self.options.exit_on_publisher_end and self._had_publishers and not has_publishers and quiet_s > QUIET_S:
+            self._supply(self._intake.flush())
+            self.is_finished |= self._worker.pending == 0
+
+    def close(self) -> bool:
+        """Take no more messages, finish what waits, save, destroy. Whether all went well."""
+        for item in self._inputs:
+            item.close()
+        if self._keeps_all:
+            self._supply(self._intake.flush())
+        is_fine = self._attempt('SLAM', lambda: self._worker.stop(drain=self._keeps_all))
+        self._report_drops()
+        is_fine &= self._attempt('saving', self._save)
+        self.destroy_node()
+        return is_fine
+
+    def _save(self) -> None:
+        if self._folder is None:
+            return
+        if not self.options.save_on_shutdown:
+            self._folder.close()
+            return
+        metrics = self._folder.finish(self._slam)
+        self.get_logger().info(f'saved {metrics.frames} frames, {metrics.tracked} of them tracked, and '
+                               f'{metrics.num_gaussians} Gaussians in {self._folder.path}')  # fmt: skip
+
+    def _attempt(self, what: str, action: Callable[[], object]) -> bool:
+        """Do something that must not keep the rest of the shutdown from happening."""
+        try:
+            action()
+        except (SplatamError, OSError) as error:
+            self.get_logger().error(f'{what} failed: {error}')
+        except Exception as error:
+            self.get_logger().error(f'{what} failed:\n{"".join(traceback.format_exception(error))}')
+        else:
+            return True
+        return False
+
+    # --- worker's thread ---
+
+    def _on_result(self, frame: RgbdFrame, result: FrameResult) -> None:
+        if self._folder is not None:  # before anybody hears of the frame: what was answered is on disk
+            self._folder.append(frame, result, result.timings.total / 1e3)
+        self._counts[result.status] += 1
+        if result.status is Status.LOST:
+            self._warnings.warn('lost', f'lost at {stamp_text(result.stamp_ns)}: {result.reason}')
+        self._outputs.publish(result, self._slam, self._intake.camera_frame)
+        self._log_progress(result)
+
+    def _on_bad_frame(self, frame: RgbdFrame, error: FrameError) -> None:
+        self._warnings.warn('refused', f'frame {stamp_text(frame.stamp_ns)} left out: {error}')
+        self._outputs.done(frame.stamp_ns)
+
+    def _log_progress(self, result: FrameResult) -> None:
+        is_first = result.status is Status.INITIALIZED
+        if is_first or time.monotonic() - self._progress_s > PROGRESS_S:
+            self._progress_s = time.monotonic()
+            self.get_logger().info(
+                f'{sum(self._counts.values())} frames, {self._counts[Status.LOST]} lost, '
+                f'{result.num_gaussians} Gaussians, {result.timings.total:.0f} ms for this frame'
+            )

@@ -1,0 +1,157 @@
+"""The node's ROS parameters: its own, and the whole SLAM configuration below ``slam.``.
+
+Both are tables of ``Setting``: names, help, units and bounds become ROS descriptors. What the user gives is
+checked against the same tables, so that the command line and ROS complain in the same words.
+"""
+
+from __future__ import annotations
+
+import difflib
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+
+from splatam_core.config import Setting, SlamConfig, Value, flat_values, load_config, settings
+from splatam_core.errors import ConfigError
+
+SLAM = 'slam.'
+ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
+MAX_INTEGER = 2**63 - 1
+
+
+def _setting(
+    name: str, default: Value, help: str, unit: str = '', minimum: float | None = None, maximum: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Setting:  # fmt: skip
+    return Setting(name, type(default), default, help, unit, minimum, maximum, choices)
+
+
+NODE_SETTINGS: tuple[Setting, ...] = (
+    _setting('preset', 'splatam', 'SLAM preset: the name of a shipped one, or a .yaml file.'),
+    _setting('save_path', '', 'Folder for trajectory, map and metrics; must be new or empty. Empty = nothing is saved.'),
+    _setting('overwrite', False, 'Replace the run that is in save_path, if nothing else is there.'),
+    _setting('save_on_shutdown', True, 'Save map and metrics at the end; the trajectory is written as it goes anyway.'),
+    _setting('width', 0, 'Resize frames to this width; 0 = as they come.', 'px', 0, 16384),
+    _setting('map_frame', 'map', 'Frame of poses and map: the first camera, optical axes.'),
+    _setting('rgb_transport', 'raw', 'What rgb/image carries; compressed: rgb/image/compressed.',
+             choices=('raw', 'compressed')),
+    _setting('depth_transport', 'raw', 'What depth/image carries; compressedDepth: depth/image/compressedDepth.',
+             choices=('raw', 'compressedDepth')),
+    _setting('sync.mode', 'approximate', 'Pair colour and depth of equal, or of nearby stamps.',
+             choices=('exact', 'approximate')),
+    _setting('sync.max_interval', 0.02, 'Stamps of a pair differ by at most this.', 's', 0.0, 10.0),
+    _setting('sync.queue_size', 30, 'Images of each kind that wait for their partner.', '', 1, 1000),
+    _setting('input_reliability', 'auto', 'QoS of the inputs; auto: reliable, unless a publisher is best effort.',
+             choices=('auto', 'reliable', 'best_effort')),
+    _setting('queue_policy', 'latest', 'When frames come faster than SLAM: latest drops old ones, all keeps every one.',
+             choices=('latest', 'all')),
+    _setting('queue_size', 2, 'Frames that wait for SLAM.', '', 1, 1000),
+    _setting('max_cloud_points', 200_000, 'Points of a published cloud at most.', '', 1, 50_000_000),
+    _setting('max_path_poses', 2000, 'Poses of a published path at most; older ones are thinned out.', '', 2, 1_000_000),
+    _setting('publish_rate.path', 1.0, 'Paths a second at most; 0 = one a frame.', 'Hz', 0.0, 1000.0),
+    _setting('publish_rate.render', 0.0, 'Renders a second at most; 0 = one a frame.', 'Hz', 0.0, 1000.0),
+    _setting('publish_rate.cloud', 1.0, 'Clouds a second at most; 0 = one a frame.', 'Hz', 0.0, 1000.0),
+    _setting('no_data_timeout', 5.0, 'Say why when no frame has come for this long; 0 = never.', 's', 0.0, 3600.0),
+    _setting('exit_on_publisher_end', False, 'Save and exit once the image publishers have left and all is processed.'),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class NodeOptions:
+    """The node's own parameters; ``NODE_SETTINGS`` says what each is. Dots are underscores here."""
+
+    preset: str
+    save_path: str
+    overwrite: bool
+    save_on_shutdown: bool
+    width: int
+    map_frame: str
+    rgb_transport: str
+    depth_transport: str
+    sync_mode: str
+    sync_max_interval: float
+    sync_queue_size: int
+    input_reliability: str
+    queue_policy: str
+    queue_size: int
+    max_cloud_points: int
+    max_path_poses: int
+    publish_rate_path: float
+    publish_rate_render: float
+    publish_rate_cloud: float
+    no_data_timeout: float
+    exit_on_publisher_end: bool
+
+    @property
+    def folder(self) -> Path | None:
+        """Where to save; None = nowhere."""
+        return Path(self.save_path).expanduser() if self.save_path else None
+
+
+def declare(node: Node) -> tuple[NodeOptions, SlamConfig]:
+    """Declare every parameter of a node that was made with ``automatically_declare_parameters_from_overrides``.
+
+    Raises:
+        ConfigError: an unknown ``slam.`` parameter, or a value that is not allowed.
+    """
+    given = {name: parameter.value for name, parameter in node.get_parameters_by_prefix('').items()}
+    own = _checked(given)
+    _check_names(node, given)
+    slam = {name.removeprefix(SLAM): value for name, value in given.items() if name.startswith(SLAM)}
+    config = _load(own['preset'], slam)
+    for setting in NODE_SETTINGS:
+        _declare(node, setting.name, setting, own[setting.name])
+    values = flat_values(config)
+    for setting in settings():
+        _declare(node, SLAM + setting.name, setting, values[setting.name])
+    return NodeOptions(**{name.replace('.', '_'): value for name, value in own.items()}), config
+
+
+def _checked(given: Mapping[str, object]) -> dict[str, Value]:
+    return {setting.name: setting.check(given.get(setting.name, setting.default)) for setting in NODE_SETTINGS}
+
+
+def _load(preset: str, slam: Mapping[str, object]) -> SlamConfig:
+    try:
+        return load_config(preset, slam)
+    except ConfigError as error:
+        raise ConfigError(f'parameters slam.*: {error}' if slam else str(error)) from None
+
+
+def _check_names(node: Node, given: Mapping[str, object]) -> None:
+    """Warn of parameters that are nobody's; a file for several nodes may name them rightly."""
+    known = [setting.name for setting in NODE_SETTINGS]
+    for name in given:
+        if name not in known and not name.startswith((SLAM, *ROS_OWN)):
+            close = difflib.get_close_matches(name, known, n=1)
+            hint = f"; did you mean '{close[0]}'?" if close else ''
+            node.get_logger().warning(f"unknown parameter '{name}' is ignored{hint}")
+
+
+def _declare(node: Node, name: str, setting: Setting, value: Value) -> None:
+    """Declare one parameter, anew if the user gave it: only now its type and bounds are known to ROS."""
+    if node.has_parameter(name):
+        node.undeclare_parameter(name)
+    node.declare_parameter(name, value, _descriptor(setting), ignore_override=True)
+
+
+def _descriptor(setting: Setting) -> ParameterDescriptor:
+    unit = f' [{setting.unit}]' if setting.unit else ''
+    descriptor = ParameterDescriptor(description=setting.help + unit, read_only=True)
+    if setting.choices:
+        descriptor.additional_constraints = 'one of ' + ', '.join(setting.choices)
+    if setting.minimum is None and setting.maximum is None:
+        return descriptor
+    if setting.type is int:
+        low = -MAX_INTEGER if setting.minimum is None else int(setting.minimum)
+        high = MAX_INTEGER if setting.maximum is None else int(setting.maximum)
+        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
+    else:
+        low = -sys.float_info.max if setting.minimum is None else setting.minimum
+        high = sys.float_info.max if setting.maximum is None else setting.maximum
+        descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+    return descriptor

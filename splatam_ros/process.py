@@ -1,0 +1,94 @@
+"""What the node's process and the player's have in common: transport, signals, ROS up and down."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType, TracebackType
+
+import rclpy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from splatam_core.errors import SplatamError
+from splatam_core.resources import config_dir
+
+PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+
+
+class RosError(SplatamError):
+    """A ROS argument, parameter or topic that cannot be used."""
+
+
+class StopRequest:
+    """Turns SIGINT and SIGTERM into a request, however often they come, so that work ends in good order.
+
+    rclpy's own handlers would tear the context down at once: nothing could be published any more.
+    Use as a context manager in the main thread.
+    """
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self) -> None:
+        self.signal: signal.Signals | None = None
+        self._previous: dict[signal.Signals, object] = {}
+
+    @property
+    def requested(self) -> bool:
+        """Whether a signal has come."""
+        return self.signal is not None
+
+    def __enter__(self) -> StopRequest:
+        self._previous = {number: signal.signal(number, self._request) for number in self.SIGNALS}
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+
+    def _request(self, number: int, frame: FrameType | None) -> None:
+        self.signal = self.signal or signal.Signals(number)
+
+
+def own_arguments(arguments: Sequence[str]) -> list[str]:
+    """What of a command line is not for ROS, without the program's name.
+
+    Raises:
+        RosError: the ROS arguments cannot be parsed.
+    """
+    try:
+        return remove_ros_args(list(arguments))[1:]
+    except RuntimeError as error:
+        raise RosError(f'ROS arguments: {_first_sentence(error)}') from None
+
+
+@contextmanager
+def ros(arguments: Sequence[str]) -> Iterator[None]:
+    """ROS for the duration of a ``with``: a transport that takes large images, no signal handlers.
+
+    Args:
+        arguments: the command line, program name included.
+
+    Raises:
+        RosError: the ROS arguments cannot be parsed.
+    """
+    os.environ.setdefault(PROFILE_VARIABLE, str(config_dir() / 'fastdds_large_data.xml'))
+    try:
+        rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:  # rclpy's errors have no narrower public base
+        raise RosError(f'ROS arguments: {_first_sentence(error)}') from None
+    try:
+        yield
+    finally:
+        rclpy.try_shutdown()
+
+
+def _first_sentence(error: Exception) -> str:
+    """rcl's message without its own preamble, and without the source lines it appends."""
+    return str(error).split(', at /')[0].removeprefix('failed to initialize rcl: ').removeprefix(
+        'Failed to parse ROS arguments: '
+    )
