@@ -39,7 +39,7 @@ def recording() -> Callable[[str], Path]:
 
 @pytest.fixture(scope='session')
 def room() -> Callable[..., SyntheticSequence]:
-    """``room(frames=3, width=64, noise=False)``: a short synthetic recording with exact poses; cheap after the first."""
+    """``room(frames=3, width=64, noise=False)``: a short synthetic recording; cheap after the first."""
 
     def make(frames: int = 3, width: int = 64, *, noise: bool = True, seed: int = 0) -> SyntheticSequence:
         return SyntheticSequence(seed=seed, noise=noise, frames=frames, width=width)

@@ -61,6 +61,11 @@ MAX_INTERVAL_NS = 20_000_000
 JUMP_NS = 1_000_000_000
 MILLIMETRES = 1000.0
 DEPTH_ENCODINGS = ('16UC1', 'mono16', '32FC1')
+RELIABLE = Qos(
+    QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLATILE, QosTime(0, 0), QosTime(0, 0),
+    QosLiveliness.SYSTEM_DEFAULT, QosTime(0, 0), False,
+)  # fmt: skip
+"""What written topics say they were offered with; players offer the same."""
 
 _log = logging.getLogger(__name__)
 
@@ -86,7 +91,7 @@ class BagSequence:
         self._color, self._depth = (_Stream(bag, chosen[kind], index.recorded_ns(kind)) for kind in ('rgb', 'depth'))
         self._counts_scale, self.depth_scale = _depth_scale(bag, chosen['depth'], stated)
         self._path = path
-        self.name = path.resolve().stem
+        self.name = path.resolve().name if path.is_dir() else path.stem
         self.camera = self._frames.camera
 
     def __len__(self) -> int:
@@ -118,6 +123,7 @@ class _Bag:
     def __init__(self, path: Path) -> None:
         _check_closed(path)
         self.path = path
+        self._encodings: dict[str, str] = {}
         with _reading(path), Reader(path) as reader:
             self.connections = [
                 connection._replace(owner=None) for connection in reader.connections if connection.msgcount
@@ -145,10 +151,15 @@ class _Bag:
             for connection, recorded_ns, data in reader.messages(connections, start=start_ns):
                 yield connection.topic, recorded_ns, data
 
-    def first(self, topic: str) -> Any:
-        """The first message of a topic."""
-        _, _, data = next(self.messages([topic]))
-        return self.decode(topic, data)
+    def encoding(self, topic: str) -> str:
+        """How the first image on a topic is encoded: its encoding, or a compressed image's format."""
+        if topic not in self._encodings:
+            first = next(self.messages([topic]), None)
+            if first is None:
+                raise DatasetError(f'{self.path}: {topic} has no messages, though the bag states some; is it complete?')
+            message = self.decode(topic, first[2])
+            self._encodings[topic] = message.encoding if self.type_of(topic) == IMAGE else message.format
+        return self._encodings[topic]
 
     def decode(self, topic: str, data: bytes) -> Any:
         """A message as rosbags' object of its type."""
@@ -267,9 +278,9 @@ def _reading(path: Path) -> Iterator[None]:
     """Whatever the storage libraries raise inside means a broken bag: one error that says so."""
     try:
         yield
-    except (SplatamError, GeneratorExit):
+    except SplatamError:
         raise
-    except Exception as error:  # noqa: BLE001 - broken files surface as any of a dozen types, asserts included
+    except Exception as error:  # broken files surface as any of a dozen types, assertions included
         reason = str(error).strip() or type(error).__name__
         raise DatasetError(f'{path}: cannot be read as a rosbag2, it may be truncated: {reason}') from error
 
@@ -334,8 +345,8 @@ def _pairs(bag: _Bag, chosen: dict[str, str], index: _Index) -> list[RgbdSet]:
     pairs += pairing.flush()
     if not pairs:
         raise DatasetError(
-            f"{bag.path}: none of {counts['rgb']} images on {chosen['rgb']} and {counts['depth']} on "
-            f"{chosen['depth']} are within {MAX_INTERVAL_NS / 1e6:g} ms of each other by their header stamps"
+            f'{bag.path}: none of {counts["rgb"]} images on {chosen["rgb"]} and {counts["depth"]} on '
+            f'{chosen["depth"]} are within {MAX_INTERVAL_NS / 1e6:g} ms of each other by their header stamps'
         )
     if len(pairs) < counts['rgb']:
         _log.warning('%s: %d of %d colour images have no depth', bag.path, counts['rgb'] - len(pairs), counts['rgb'])
@@ -346,7 +357,7 @@ def _pairs(bag: _Bag, chosen: dict[str, str], index: _Index) -> list[RgbdSet]:
 def _depth_scale(bag: _Bag, topic: str, stated: CameraFile | None) -> tuple[float, float | None]:
     """Counts per metre of 16-bit depth, and the same as ``Sequence`` states it: None for depth in metres."""
     scale = (stated.depth_scale if stated else None) or MILLIMETRES
-    return scale, None if '32FC1' in _encoding(bag, topic) else scale
+    return scale, None if '32FC1' in bag.encoding(topic) else scale
 
 
 # --- choosing topics ---
@@ -393,16 +404,11 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _kind(bag: _Bag, topic: str) -> str:
-    encoding = _encoding(bag, topic)
+    encoding = bag.encoding(topic)
     if bag.type_of(topic) == IMAGE:
         return 'depth' if encoding in DEPTH_ENCODINGS else 'rgb'
     is_depth = 'compressedDepth' in encoding or encoding.startswith(DEPTH_ENCODINGS) or 'depth' in topic.lower()
     return 'depth' if is_depth else 'rgb'
-
-
-def _encoding(bag: _Bag, topic: str) -> str:
-    message = bag.first(topic)
-    return message.encoding if bag.type_of(topic) == IMAGE else message.format
 
 
 def _namespace(topic: str) -> str:
@@ -435,7 +441,7 @@ def write(sequence: base.Sequence, folder: Path, storage: str, compressed: bool,
         topics['truth'] = _Topic(TRUTH_TOPIC, POSE)
     with Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
         connections = {
-            kind: writer.add_connection(topic.name, topic.type, typestore=_types(), offered_qos_profiles=[_RELIABLE])
+            kind: writer.add_connection(topic.name, topic.type, typestore=_types(), offered_qos_profiles=[RELIABLE])
             for kind, topic in topics.items()
         }
         for kind, stamp_ns, message in _messages_of(sequence, truth, compressed, indices):
@@ -492,12 +498,6 @@ def _covering(sequence: base.Sequence) -> list[tuple[int, NDArray[np.float64]]]:
     start = max(int(np.searchsorted(truth.stamps_ns, first_ns, side='right')) - 1, 0)
     stop = int(np.searchsorted(truth.stamps_ns, last_ns, side='left')) + 1
     return [(int(stamp), T) for stamp, T in zip(truth.stamps_ns[start:stop], truth.T_world_cam[start:stop])]
-
-
-_RELIABLE = Qos(
-    QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLATILE, QosTime(0, 0), QosTime(0, 0),
-    QosLiveliness.SYSTEM_DEFAULT, QosTime(0, 0), False,
-)  # fmt: skip
 
 
 def _recognises(source: str) -> bool:

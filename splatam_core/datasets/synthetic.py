@@ -38,7 +38,9 @@ SCHEME = 'synthetic'
 class SyntheticSequence:
     """As many frames as asked of one walk through one room."""
 
-    def __init__(self, *, seed: int = 0, noise: bool = True, frames: int = LOOP_FRAMES, width: int | None = None) -> None:
+    def __init__(
+        self, *, seed: int = 0, noise: bool = True, frames: int = LOOP_FRAMES, width: int | None = None
+    ) -> None:
         self.name = f'{SCHEME}_{seed}'
         self.camera = FrameFactory(CameraCalibration(CAMERA), width).camera
         self.depth_scale: float | None = 1000.0 if noise else None

@@ -17,6 +17,7 @@ colour image's stamp.
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -132,7 +133,7 @@ def _read_list(path: Path) -> list[tuple[int, str]]:
         for number, line in enumerate(lines, 1)
         if line.strip() and not line.lstrip().startswith('#')
     ]
-    for (before, _), (after, _) in zip(rows, rows[1:], strict=False):
+    for (before, _), (after, _) in pairwise(rows):
         if after <= before:
             raise DatasetError(f'{path}: stamps must increase, but {stamp_text(after)} follows {stamp_text(before)}')
     return rows

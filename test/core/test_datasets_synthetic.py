@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
@@ -64,6 +66,16 @@ def test_depth_at_known_walls(room):
         assert cast.depth_m[12, 16] == pytest.approx(distance, abs=5e-3)  # pictures hang 4 mm in front of the wall
 
 
+def test_every_ray_meets_something_wherever_the_camera_is(room):
+    """Close to furniture surfaces reach behind the camera; none may be lost there, or the room has holes."""
+    sequence, rng = room(), np.random.default_rng(0)
+    camera = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
+    for _ in range(40):
+        eye = rng.uniform([-1.4, -1.4, 1.2], [1.4, 0.9, 2.4])
+        T_world_cam = look_at(eye, rng.uniform([-2, -2, 0], [2, 2, 2.5]), rng.normal())
+        assert sequence._room.cast(camera, T_world_cam).depth_m.max() < np.linalg.norm(ROOM_SIZE_M)
+
+
 def test_frame_depends_on_nothing_but_seed_index_and_width(room):
     long, short = room(frames=40, width=48), room(frames=8, width=48)
     later, first = long[7], short[2]
@@ -90,7 +102,7 @@ def test_stamps_and_truth(room):
 
 def test_walk_is_smooth_stays_inside_and_comes_back():
     truth = SyntheticSequence(frames=700, width=32).ground_truth().T_world_cam
-    steps = np.array([se3.log(se3.inverse(a) @ b) for a, b in zip(truth, truth[1:])])
+    steps = np.array([se3.log(se3.inverse(a) @ b) for a, b in pairwise(truth)])
     assert np.linalg.norm(steps[:, :3], axis=1).max() * 30 < 0.5  # metres per second: a calm hand
     assert np.degrees(np.linalg.norm(steps[:, 3:], axis=1)).max() * 30 < 30  # degrees per second
     assert np.abs(np.diff(steps, axis=0)).max() < 2e-3  # metres or radians from one step to the next: no jerks
@@ -114,7 +126,9 @@ def test_small_frame_is_the_large_one_resized(room):
     small, large = room(frames=1, width=160, noise=False)[0], room(frames=1, width=320, noise=False)[0]
     averaged = cv2.resize(large.rgb, (160, 120), interpolation=cv2.INTER_AREA)
     difference = np.abs(averaged.astype(float) - small.rgb)
-    moved = np.abs(cv2.resize(np.roll(large.rgb, 1, axis=1), (160, 120), interpolation=cv2.INTER_AREA) - small.rgb.astype(float))
+    moved = np.abs(
+        cv2.resize(np.roll(large.rgb, 1, axis=1), (160, 120), interpolation=cv2.INTER_AREA) - small.rgb.astype(float)
+    )
     assert difference.mean() < 4  # grey levels: 16 rays to a pixel against 4
     assert moved.mean() > 1.5 * difference.mean()  # half a small pixel to the side is clearly worse
 

@@ -15,8 +15,9 @@ Color = tuple[float, float, float]
 
 PIGMENTS = np.float32(
     [
-        (0.78, 0.62, 0.36), (0.62, 0.24, 0.16), (0.17, 0.26, 0.4), (0.86, 0.82, 0.7), (0.24, 0.38, 0.3), (0.5, 0.5, 0.48),
-        (0.1, 0.1, 0.12), (0.84, 0.48, 0.2), (0.36, 0.55, 0.66), (0.45, 0.3, 0.2), (0.7, 0.68, 0.3), (0.55, 0.2, 0.3),
+        (0.78, 0.62, 0.36), (0.62, 0.24, 0.16), (0.17, 0.26, 0.4), (0.86, 0.82, 0.7),
+        (0.24, 0.38, 0.3), (0.5, 0.5, 0.48), (0.1, 0.1, 0.12), (0.84, 0.48, 0.2),
+        (0.36, 0.55, 0.66), (0.45, 0.3, 0.2), (0.7, 0.68, 0.3), (0.55, 0.2, 0.3),
     ]
 )  # fmt: skip
 """What covers, spines and pictures are printed with."""
@@ -26,6 +27,9 @@ def noise(rng: np.random.Generator, height: int, width: int, *, coarsest: int = 
     """Smooth noise of many scales, [h, w], zero mean and unit variance.
 
     Args:
+        rng: decides the noise.
+        height: rows.
+        width: columns.
         coarsest: size of the largest blobs in texels; each octave below has half of it.
         gain: amplitude of an octave over that of the next coarser one.
     """
@@ -112,7 +116,9 @@ def fabric(rng: np.random.Generator, height: int, width: int, base: Color, accen
 
 def rug(rng: np.random.Generator, height: int, width: int) -> Paint:
     """A carpet: framed borders around a field of diamonds."""
-    palette = np.float32([(0.52, 0.1, 0.12), (0.82, 0.68, 0.42), (0.1, 0.16, 0.34), (0.25, 0.42, 0.36), (0.7, 0.35, 0.2)])
+    palette = np.float32(
+        [(0.52, 0.1, 0.12), (0.82, 0.68, 0.42), (0.1, 0.16, 0.34), (0.25, 0.42, 0.36), (0.7, 0.35, 0.2)]
+    )
     y, x = np.mgrid[:height, :width].astype(np.float32)
     edge = np.minimum(np.minimum(x, width - 1 - x), np.minimum(y, height - 1 - y))
     diamond = np.abs(x % 90 - 45) + np.abs(y % 90 - 45)
@@ -181,7 +187,9 @@ def window(rng: np.random.Generator, height: int, width: int) -> Paint:
     return np.clip(paint, 0, 1).astype(np.float32)
 
 
-def tiles(rng: np.random.Generator, height: int, width: int, base: Color = (0.86, 0.86, 0.84), pitch: int = 120) -> Paint:
+def tiles(
+    rng: np.random.Generator, height: int, width: int, base: Color = (0.86, 0.86, 0.84), pitch: int = 120
+) -> Paint:
     """Ceiling tiles: dark joints, speckles, each tile a little different."""
     y, x = np.mgrid[:height, :width]
     tones = rng.normal(0, 0.04, (height // pitch + 1, width // pitch + 1)).astype(np.float32)
