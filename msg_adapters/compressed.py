@@ -85,7 +85,7 @@ def _decoded(data: bytes, flags: int, image_format: str) -> NDArray[Any]:
 
 
 def _is_complete(data: bytes) -> bool:
-    """Whether the end marker follows the start of the pixels; decoders fill what is missing with grey."""
+    """Whether an end marker follows the pixels; OpenCV before 4.12 fills what is missing with grey."""
     end, start = (b'\xff\xd9', b'\xff\xda') if data.startswith(_JPEG) else (b'IEND', b'IDAT')
     return data.rfind(end) > data.find(start) > 0 and data.rfind(end) > data.rfind(start)
 

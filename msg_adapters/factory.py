@@ -73,7 +73,7 @@ def _message_class(type_name: str) -> type:
 
 
 def _rclpy_value(value: Any) -> Any:
-    """Numpy arrays as what rclpy's fields take; bytes go through array.array, any other way is 10 to 1000 times slower."""
+    """Numpy arrays as rclpy's fields take them; bytes by array.array, other ways are 10 to 1000 times slower."""
     if not isinstance(value, np.ndarray):
         return value
     if value.dtype != np.uint8:

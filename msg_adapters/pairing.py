@@ -43,8 +43,8 @@ def first_pair(
     i = j = 0
     while i < len(color) and j < len(depth):
         color_is_older = color[i] <= depth[j]
-        heads = color[i : i + 2], depth[j : j + 2]
-        older, other = heads if color_is_older else reversed(heads)
+        next_color, next_depth = color[i : i + 2], depth[j : j + 2]
+        older, other = (next_color, next_depth) if color_is_older else (next_depth, next_color)
         verdict = _judge(older, other, max_interval_ns, is_final)
         if verdict is _Verdict.PAIR:
             return color[i], depth[j]
@@ -69,12 +69,9 @@ def _judge(older: Sequence[Key], other: Sequence[Key], max_interval_ns: int, is_
     rival_gap = _distance(older[1], other[0])
     if rival_gap >= gap:
         return _Verdict.PAIR
-    if rival_gap == 0:
-        return _Verdict.SKIP
-    if len(other) < 2:
-        return _Verdict.SKIP if is_final else _Verdict.WAIT
     # The rival fits better; but if it has a still better partner of its own, everybody gets one.
-    return _Verdict.PAIR if _distance(older[1], other[1]) < rival_gap else _Verdict.SKIP
+    is_rival_content = len(other) > 1 and _distance(older[1], other[1]) < rival_gap
+    return _Verdict.PAIR if is_rival_content else _Verdict.SKIP
 
 
 def _distance(a: Key, b: Key) -> float:

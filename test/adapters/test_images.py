@@ -124,7 +124,8 @@ def test_decoded_images_do_not_share_the_messages_memory(factory):
 
 @pytest.mark.parametrize('padding', [0, 5])
 @pytest.mark.parametrize(
-    ('encoding', 'channels'), [('rgb8', [0, 1, 2]), ('bgr8', [2, 1, 0]), ('rgba8', [0, 1, 2, 0]), ('bgra8', [2, 1, 0, 1])]
+    ('encoding', 'channels'),
+    [('rgb8', [0, 1, 2]), ('bgr8', [2, 1, 0]), ('rgba8', [0, 1, 2, 0]), ('bgra8', [2, 1, 0, 1])],
 )
 def test_channel_orders(factory, encoding, channels, padding):
     message = raw_message(factory, random_rgb()[..., channels], encoding, padding=padding)
@@ -237,6 +238,13 @@ def test_truncated_compressed_colour_is_an_error(factory, format, share):
     data = bytes(whole.data)
     with pytest.raises(MessageError, match='truncated|neither'):
         images.decode_color(compressed_message(factory, whole.format, data[: int(share * len(data))]))
+
+
+def test_a_jpeg_without_its_end_is_an_error(factory):
+    """OpenCV 4.6 decodes it, and also one whose last rows are missing, as grey."""
+    whole = images.compressed_color_message(factory, smooth_rgb(), STAMP_NS, FRAME)
+    with pytest.raises(MessageError, match='truncated'):
+        images.decode_color(compressed_message(factory, whole.format, bytes(whole.data)[:-2]))
 
 
 @pytest.mark.parametrize('length', [0, 11, 12, 15, 60, -5])

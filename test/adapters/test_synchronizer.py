@@ -163,6 +163,11 @@ def test_the_info_of_the_colours_stamp_is_preferred_else_the_newest_received():
     assert [s.info.stamp_ns for s in feed.sets] == [2, 3]
 
 
+def test_the_newest_info_is_the_last_received_whatever_its_stamp():
+    feed = Feed(with_info=False).add('info', 1, 2, 1).add('color', 9).add('depth', 9)
+    assert feed.sets[0].info.serial == 3
+
+
 def test_an_info_sent_once_serves_later_loops():
     feed = Feed(with_info=False).add('info', 5 * SECOND)
     for _ in range(2):
@@ -196,6 +201,8 @@ def test_a_better_partner_is_waited_for():
 
 def test_equal_stamps_need_no_waiting():
     feed = Feed('approximate', max_interval_ns=20).add('color', 100, 133).add('depth', 100)
+    assert feed.pairs == [(100, 100)]
+    feed = Feed('approximate', max_interval_ns=20).add('color', 90, 100).add('depth', 100)
     assert feed.pairs == [(100, 100)]
 
 
@@ -233,6 +240,10 @@ def test_first_pair_skips_what_has_no_partner():
     keys = [Key(0, 5), Key(1, 3)]
     assert first_pair(keys, [Key(0, 9), Key(1, 3)], 2) == (Key(1, 3), Key(1, 3))
     assert first_pair(keys, [], 2) is None
+
+
+def test_first_pair_compares_no_stamps_of_different_epochs():
+    assert first_pair([Key(0, 5)], [Key(1, 5)], 2, is_final=True) is None
 
 
 # Time jumps back
@@ -281,6 +292,11 @@ def test_a_small_step_back_is_no_jump():
     assert feed.statistics.resets == 0
 
 
+def test_a_jump_is_measured_from_the_newest_stamp_not_from_the_last():
+    feed = Feed(jump_ns=SECOND).add('color', 50 * SECOND, 49_500 * MS, 48_900 * MS).add('depth', 48_900 * MS)
+    assert (feed.stamps, feed.statistics.resets) == ([48_900 * MS], 1)
+
+
 def test_after_a_jump_the_old_messages_are_dropped():
     feed = Feed().add('color', 90 * SECOND, 91 * SECOND).add('color', SECOND).add('depth', SECOND)
     assert feed.stamps == [SECOND]
@@ -324,12 +340,13 @@ def test_a_driver_that_restarts_with_another_clock_pairs_again():
 
 # Whatever comes
 
+modes = st.sampled_from(['exact', 'approximate'])
 streams = st.sampled_from(['color', 'depth', 'info'])
 stamps = st.one_of(st.integers(0, 40), st.integers(0, 3).map(lambda i: 1000 * i))
 arrivals = st.lists(st.tuples(streams, stamps), max_size=60)
 any_settings = st.fixed_dictionaries(
     {
-        'mode': st.sampled_from(['exact', 'approximate']),
+        'mode': modes,
         'max_interval_ns': st.integers(0, 12),
         'queue_size': st.integers(1, 6),
         'jump_ns': st.sampled_from([5, 20, 500]),
@@ -375,7 +392,7 @@ increasing = st.lists(st.integers(0, 120), max_size=25, unique=True).map(sorted)
 
 
 @settings(max_examples=300, deadline=None)
-@given(increasing, increasing, st.randoms(use_true_random=False), st.integers(0, 12), st.sampled_from(['exact', 'approximate']))
+@given(increasing, increasing, st.randoms(use_true_random=False), st.integers(0, 12), modes)
 def test_pairs_do_not_depend_on_how_the_streams_interleave(color, depth, rng, interval, mode):
     in_order = sorted([(stamp, 'color') for stamp in color] + [(stamp, 'depth') for stamp in depth])
     expected = Feed(mode, max_interval_ns=interval, queue_size=25)
