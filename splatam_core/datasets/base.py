@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core.camera import CameraCalibration, CameraFile, PinholeCamera, read_camera_file
+from splatam_core.camera import CameraFile, PinholeCamera, read_camera_file
 from splatam_core.errors import DatasetError
 from splatam_core.types import RgbdFrame, Trajectory
 
@@ -89,12 +89,16 @@ class Format:
         expects: what a source of this format holds, for the error about an unknown one.
         recognises: whether a SOURCE looks like this format; looks at names only.
         open: opens the whole recording; the window of ``ReadOptions`` is cut by the caller.
+        is_path: whether a source is a file or folder.
+        has_topics: whether topics can be chosen.
     """
 
     name: str
     expects: str
     recognises: Callable[[str], bool]
     open: Callable[[str, ReadOptions], Sequence]
+    is_path: bool = True
+    has_topics: bool = False
 
 
 class Window:
@@ -197,19 +201,6 @@ def check_increasing(stamps_ns: NDArray[np.int64], name: str) -> None:
             f'{name}: time does not increase from frame {at - 1} ({int(stamps_ns[at - 1])} ns) to frame {at} '
             f'({int(stamps_ns[at])} ns); cut the recording there'
         )
-
-
-def calibration_for(stated: CameraFile | None, default: CameraCalibration | None, advice: str) -> CameraCalibration:
-    """The camera: as ``camera.yaml`` states it, else the default.
-
-    Raises:
-        DatasetError: there is neither; ``advice`` says what to do.
-    """
-    if stated is not None:
-        return stated.calibration
-    if default is None:
-        raise DatasetError(advice)
-    return default
 
 
 def _read_image(path: Path, flags: int) -> NDArray[np.uint8]:

@@ -42,9 +42,9 @@ def open_sequence(
     """
     options = ReadOptions(width, start, max_frames, topics or BagTopics())
     reader = _reader(format) if format is not None else _guess(source)
-    if reader.name != 'synthetic' and not Path(source).exists():
+    if reader.is_path and not Path(source).exists():
         raise DatasetError(f'{source}: there is no such file or folder')
-    if reader.name != 'rosbag' and options.topics != BagTopics():
+    if not reader.has_topics and options.topics != BagTopics():
         raise DatasetError(f'{source}: is read as {reader.name}, where there are no topics to choose; leave them out')
     return cut(reader.open(source, options), options)
 

@@ -89,7 +89,7 @@ class BagSequence:
         self._pairs = _pairs(bag, chosen, index)
         self._truth = index.truth
         self._color, self._depth = (_Stream(bag, chosen[kind], index.recorded_ns(kind)) for kind in ('rgb', 'depth'))
-        self._counts_scale, self.depth_scale = _depth_scale(bag, chosen['depth'], stated)
+        self.depth_scale = _depth_scale(bag, chosen['depth'], stated)
         self._path = path
         self.name = path.resolve().name if path.is_dir() else path.stem
         self.camera = self._frames.camera
@@ -105,8 +105,8 @@ class BagSequence:
             depth_m = images.decode_depth(self._depth[pair.depth])
         except MessageError as error:
             raise FrameError(f'{self._path}: image at {stamp_text(pair.stamp_ns)} s: {error}') from None
-        if self._counts_scale != MILLIMETRES:
-            depth_m = depth_m * np.float32(MILLIMETRES / self._counts_scale)
+        if self.depth_scale not in (None, MILLIMETRES):
+            depth_m = depth_m * np.float32(MILLIMETRES / self.depth_scale)  # decoded as millimetres, as ROS has it
         return self._frames.make(pair.stamp_ns, rgb, depth_m)
 
     def ground_truth(self) -> Trajectory | None:
@@ -237,7 +237,9 @@ class _Index:
         """
         kinds = {topic: kind for kind, topic in chosen.items()}
         counts = dict.fromkeys(kinds, 0)
-        entries, infos, truth = [], {}, {}
+        entries: list[_Entry] = []
+        infos: dict[CameraCalibration, int] = {}
+        truth: dict[int, NDArray[np.float64]] = {}
         for topic, recorded_ns, data in bag.messages(kinds):
             counts[topic] += 1
             stamp_ns = _stamp_ns(bag, topic, data)
@@ -281,7 +283,7 @@ def _reading(path: Path) -> Iterator[None]:
     except SplatamError:
         raise
     except Exception as error:  # broken files surface as any of a dozen types, assertions included
-        reason = str(error).strip() or type(error).__name__
+        reason = ' '.join(str(error).split()) or type(error).__name__
         raise DatasetError(f'{path}: cannot be read as a rosbag2, it may be truncated: {reason}') from error
 
 
@@ -354,10 +356,11 @@ def _pairs(bag: _Bag, chosen: dict[str, str], index: _Index) -> list[RgbdSet]:
     return pairs
 
 
-def _depth_scale(bag: _Bag, topic: str, stated: CameraFile | None) -> tuple[float, float | None]:
-    """Counts per metre of 16-bit depth, and the same as ``Sequence`` states it: None for depth in metres."""
-    scale = (stated.depth_scale if stated else None) or MILLIMETRES
-    return scale, None if '32FC1' in bag.encoding(topic) else scale
+def _depth_scale(bag: _Bag, topic: str, stated: CameraFile | None) -> float | None:
+    """Counts per metre of 16-bit depth; None for depth in metres."""
+    if '32FC1' in bag.encoding(topic):
+        return None
+    return (stated.depth_scale if stated else None) or MILLIMETRES
 
 
 # --- choosing topics ---
@@ -367,10 +370,9 @@ def _choose_topics(bag: _Bag, wanted: base.BagTopics, *, need_info: bool) -> dic
     """Topic of each kind: rgb, depth, info where it is needed, truth where there is one."""
     kinds = {topic: _kind(bag, topic) for topic in bag.topics(IMAGE, COMPRESSED)}
     found = {kind: [topic for topic in kinds if kinds[topic] == kind] for kind in ('rgb', 'depth')}
-    chosen = {
-        'rgb': _choose(bag, 'colour image', '--rgb', wanted.rgb, found['rgb'], list(kinds)),
-        'depth': _choose(bag, 'depth image', '--depth', wanted.depth, found['depth'], list(kinds)),
-    }
+    chosen = {'rgb': _choose(bag, 'colour image', '--rgb', wanted.rgb, found['rgb'], list(kinds))}
+    others = [topic for topic in kinds if topic != chosen['rgb']]
+    chosen['depth'] = _choose(bag, 'depth image', '--depth', wanted.depth, found['depth'], others)
     if need_info:
         infos = bag.topics(INFO)
         beside = [topic for topic in infos if _namespace(topic) == _namespace(chosen['rgb'])]
@@ -511,4 +513,6 @@ def _open(source: str, options: base.ReadOptions) -> BagSequence:
     return BagSequence(Path(source), width=options.width, topics=options.topics)
 
 
-FORMAT = base.Format('rosbag', 'a rosbag2 folder with metadata.yaml, or a .db3 or .mcap file', _recognises, _open)
+FORMAT = base.Format(
+    'rosbag', 'a rosbag2 folder with metadata.yaml, or a .db3 or .mcap file', _recognises, _open, has_topics=True
+)

@@ -88,8 +88,10 @@ class SevenScenesSequence:
 
     def _calibration(self, stated: CameraFile | None) -> CameraCalibration:
         path = self._folder / 'camera-intrinsics.txt'
-        if stated is not None or not path.exists():
-            return base.calibration_for(stated, DEFAULT_CAMERA, '')
+        if stated is not None:
+            return stated.calibration
+        if not path.exists():
+            return DEFAULT_CAMERA
         K = _read_matrix(path, 3)
         width, height = base.image_size(self._color[self._numbers[0]])
         return CameraCalibration(PinholeCamera(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2]))

@@ -179,4 +179,6 @@ def _switch(key: str, text: str) -> bool:
     return text == 'on'
 
 
-FORMAT = base.Format(SCHEME, f"'{SCHEME}' or '{SCHEME}:seed=N,noise=on|off,frames=N'", _recognises, _open)
+FORMAT = base.Format(
+    SCHEME, f"'{SCHEME}' or '{SCHEME}:seed=N,noise=on|off,frames=N'", _recognises, _open, is_path=False
+)

@@ -57,7 +57,7 @@ class TumSequence:
             CameraError: its ``camera.yaml`` cannot be used.
         """
         stated = base.camera_file(folder)
-        self._frames = FrameFactory(base.calibration_for(stated, _known_camera(folder), _camera_advice(folder)), width)
+        self._frames = FrameFactory(stated.calibration if stated else _known_camera(folder), width)
         self._folder = folder
         self.name = folder.resolve().name
         self.camera = self._frames.camera
@@ -99,27 +99,30 @@ def associate(a_ns: NDArray[np.int64], b_ns: NDArray[np.int64], max_interval_ns:
     return sorted(partner.items())
 
 
-def _known_camera(folder: Path) -> CameraCalibration | None:
+def _known_camera(folder: Path) -> CameraCalibration:
+    """The published calibration of the camera that the folder's name says."""
     match = re.search(r'(?<![a-z])(?:freiburg|fr)([123])(?!\d)', folder.resolve().name.lower())
-    return KNOWN_CAMERAS[match.group(1)] if match else None
-
-
-def _camera_advice(folder: Path) -> str:
-    return (
-        f"{folder}: the camera is unknown, for the folder's name does not say freiburg1, freiburg2 or freiburg3; "
-        'put a camera.yaml with width, height, fx, fy, cx, cy into the folder'
-    )
+    if match is None:
+        raise DatasetError(
+            f"{folder}: the camera is unknown, for the folder's name does not say freiburg1, freiburg2 or freiburg3; "
+            'put a camera.yaml with width, height, fx, fy, cx, cy into the folder'
+        )
+    return KNOWN_CAMERAS[match.group(1)]
 
 
 def _pairs(folder: Path, max_interval_ns: int) -> list[tuple[int, str, str]]:
     rgb, depth = _read_list(folder / 'rgb.txt'), _read_list(folder / 'depth.txt')
-    pairs = associate(*(np.array([stamp for stamp, _ in rows], np.int64) for rows in (rgb, depth)), max_interval_ns)
+    pairs = associate(_stamps_ns(rgb), _stamps_ns(depth), max_interval_ns)
     if not pairs:
         raise DatasetError(
             f'{folder}: none of {len(rgb)} colour and {len(depth)} depth images are within '
             f'{max_interval_ns / 1e6:g} ms of each other; are both lists stamped by the same clock?'
         )
     return [(*rgb[i], depth[j][1]) for i, j in pairs]
+
+
+def _stamps_ns(rows: list[tuple[int, str]]) -> NDArray[np.int64]:
+    return np.array([stamp_ns for stamp_ns, _ in rows], np.int64)
 
 
 def _read_list(path: Path) -> list[tuple[int, str]]:

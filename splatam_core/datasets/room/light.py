@@ -21,7 +21,7 @@ class Light:
     DAYLIGHT = 3.4
 
     def __init__(self, boxes: list[Box], spheres: list[Sphere]) -> None:
-        self._solids = [*boxes, *spheres]
+        self._solids: list[Box | Sphere] = [*boxes, *spheres]
         x, _, z = ROOM_SIZE_M
         side = (-1.0, 0.0, 1.0)
         self._lamp = [np.array([0.5 * a, 0.5 * b, z - 0.12]) for a in side for b in side]
