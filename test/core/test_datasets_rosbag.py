@@ -350,7 +350,7 @@ def test_chosen_topic_that_is_not_there(tmp_path):
     with pytest.raises(DatasetError, match="--rgb '/nope' is no colour image topic with messages; there is /camera/co"):
         open_sequence(bag, topics=BagTopics(rgb='/nope'))
     both = BagTopics('/camera/color/image_raw', '/camera/color/image_raw')
-    with pytest.raises(DatasetError, match='--depth .* is no depth image topic with messages; there is /camera/depth'):
+    with pytest.raises(DatasetError, match=r'--depth .* is no depth image topic with messages; there is /camera/depth'):
         open_sequence(bag, topics=both)
     with pytest.raises(DatasetError, match="--info '/nope' is no camera info topic"):
         open_sequence(bag, topics=BagTopics(info='/nope'))
