@@ -47,7 +47,7 @@ test: setup
 	@$(BIN)/python -m pytest -q
 
 demo: setup
-	@$(BIN)/python -m splatam_ros.demo $(if $(BAG),--bag '$(BAG)')
+	@$(BIN)/python -m splatam_ros.demo $(if $(BAG),'$(BAG)')
 
 # A ROS workspace as colcon sees it, outside the checkout; its virtual environment does not hold splatam_ros.
 colcon: $(VENV)/.created

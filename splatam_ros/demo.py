@@ -1,0 +1,205 @@
+"""``make demo``: a recording goes through player, DDS and node, as on a robot, and what comes out is scored.
+
+Run as ``python -m splatam_ros.demo [SOURCE] [--out DIR]``. DIR becomes the run's folder. ``DIR-input``, beside it,
+holds what was played, the SOURCE as a rosbag2 with the node's topic names and small images, and the node's log.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from types import FrameType, TracebackType
+
+SCENE = 'synthetic'
+SCENE_FRAMES = 100
+WIDTH = 320
+MARKER = '.demo'
+FINISH_TIMEOUT_S = 120.0
+STOP_TIMEOUT_S = 20.0
+LOG_LINES = 15
+
+
+class DemoError(Exception):
+    """Why the demo failed, in words for the person who started it."""
+
+
+class Processes:
+    """The demo's child processes; none outlives the ``with`` block.
+
+    Each has a session of its own: Ctrl-C reaches the demo alone, which then stops them in good order.
+    """
+
+    def __init__(self) -> None:
+        self._environment = graph_environment(os.environ, os.getpid())
+        self._started: list[subprocess.Popen[bytes]] = []
+
+    def start(self, *command: str, log: Path | None = None) -> subprocess.Popen[bytes]:
+        """Start one of the package's commands; what it says goes to the terminal, or to the log."""
+        print(f'$ {shlex.join(command)}' + (f' &> {log}' if log else ''), flush=True)
+        with log.open('wb') if log else nullcontext() as output:
+            process = subprocess.Popen(
+                [Path(sys.executable).with_name(command[0]), *command[1:]],
+                env=self._environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True,
+            )  # fmt: skip
+        self._started.append(process)
+        return process
+
+    def run(self, *command: str) -> None:
+        """Run a command to its end.
+
+        Raises:
+            DemoError: it failed.
+        """
+        process = self.start(*command)
+        if process.wait() != 0:
+            raise DemoError(f"'{' '.join(command[:2])}' {ending(process)}; what it said is above")
+
+    def __enter__(self) -> Processes:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        running = [process for process in reversed(self._started) if process.poll() is None]
+        for process in running:
+            process.send_signal(signal.SIGINT)
+        for process in running:
+            try:
+                process.wait(STOP_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def graph_environment(environment: Mapping[str, str], seed: int) -> dict[str, str]:
+    """The environment for a ROS graph that meets no other, unless the user chose which graph to join."""
+    return {
+        'ROS_DOMAIN_ID': str(1 + seed % 101),  # above 101 the ports may belong to somebody else
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        **environment,
+    }
+
+
+def ending(process: subprocess.Popen[bytes]) -> str:
+    """How a process ended, as the end of a sentence."""
+    code = process.returncode
+    return f'was killed by {signal.Signals(-code).name}' if code < 0 else f'ended with exit code {code}'
+
+
+def last_lines(log: Path) -> str:
+    """The end of a log, indented."""
+    return '\n'.join(f'  {line}' for line in log.read_text(errors='replace').splitlines()[-LOG_LINES:])
+
+
+def remove_previous(folder: Path) -> None:
+    """Remove what an earlier demo left.
+
+    Raises:
+        DemoError: somebody else made the folder.
+    """
+    if (folder / MARKER).is_file():
+        shutil.rmtree(folder)
+    elif folder.exists():
+        raise DemoError(f'{folder} exists and was not made by the demo: move it away, or choose another --out')
+
+
+def play(processes: Processes, bag: Path, out: Path, log: Path) -> None:
+    """Play the recording into the node until both have ended.
+
+    Raises:
+        DemoError: the player or the node failed.
+    """
+    parameters = {'preset': 'quick', 'save_path': out, 'queue_policy': 'all', 'exit_on_publisher_end': 'true'}
+    settings = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
+    node = processes.start('splatam_node', '--ros-args', *settings, log=log)
+    player = processes.start('splatam_bag_player', str(bag), '--rate', 'max', '--wait-for')
+    try:
+        wait_for_both(player, node)
+    except DemoError as error:
+        raise DemoError(f'{error}; the last lines of {log}:\n{last_lines(log)}') from None
+
+
+def wait_for_both(player: subprocess.Popen[bytes], node: subprocess.Popen[bytes]) -> None:
+    """Wait for the player, and then for the node, which must not end first.
+
+    Raises:
+        DemoError: one of them failed, or the node does not end.
+    """
+    while player.poll() is None:
+        if node.poll() is not None:
+            raise DemoError(f'splatam_node {ending(node)} before the recording was over')
+        time.sleep(0.1)
+    if player.returncode != 0:
+        raise DemoError(f'splatam_bag_player {ending(player)}; what it said is above')
+    try:
+        node.wait(FINISH_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        raise DemoError(f'splatam_node still runs {FINISH_TIMEOUT_S:.0f} s after the recording') from None
+    if node.returncode != 0:
+        raise DemoError(f'splatam_node {ending(node)}')
+
+
+def demo(source: str | None, out: Path) -> None:
+    """Make a bag of the source, play it, score the run.
+
+    Args:
+        source: any recording that ``splatam convert`` reads; None = a synthetic room.
+        out: folder of the run.
+
+    Raises:
+        DemoError: a step failed, and why.
+    """
+    work = out.with_name(f'{out.name}-input')
+    bag = work / 'recording'
+    remove_previous(out)
+    remove_previous(work)
+    work.mkdir(parents=True)
+    (work / MARKER).touch()
+    cut = ('--max-frames', str(SCENE_FRAMES)) if source is None else ()
+    with Processes() as processes:
+        try:
+            processes.run('splatam', 'convert', source or SCENE, str(bag), '--width', str(WIDTH), *cut)
+            play(processes, bag, out, work / 'node.log')
+            processes.run('splatam', 'evaluate', str(out), '--truth', str(bag))
+        finally:
+            if out.is_dir():
+                (out / MARKER).touch()
+
+
+def stop(number: int, frame: FrameType | None) -> None:
+    """Let SIGTERM end the demo as Ctrl-C does: with its processes."""
+    raise KeyboardInterrupt
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the demo; returns the exit code."""
+    parser = argparse.ArgumentParser('splatam_ros.demo', description='Play a recording into the node and score it.')
+    parser.add_argument(
+        'source', nargs='?', metavar='SOURCE', help='a rosbag2 or a dataset (default: a synthetic room)'
+    )
+    parser.add_argument('--out', type=Path, default=Path('out/demo'), help='folder of the run (default: %(default)s)')
+    args = parser.parse_args(arguments)
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        demo(args.source, args.out)
+        print(f'look at    {args.out}/report.png, and map.ply, trajectory.txt, metrics.json beside it')
+    except DemoError as error:
+        print(f'demo: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print('demo: interrupted', file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,117 @@
+"""The demo as a process: the whole way, what it refuses to remove, and that nothing of it lives on."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from splatam_ros.demo import remove_previous
+
+DEMO = [sys.executable, '-m', 'splatam_ros.demo']
+TAG = 'SPLATAM_TEST_DEMO'
+TIMEOUT_S = 240  # a few seconds alone, but continuous integration may share its cores
+
+
+def start_demo(out: Path, source: str) -> subprocess.Popen[str]:
+    """Start it, every process of it tagged with the folder."""
+    return subprocess.Popen(
+        [*DEMO, source, '--out', str(out)], env={**os.environ, TAG: str(out)},
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+
+
+def alive(out: Path) -> list[str]:
+    """Command lines of the processes that carry the folder's tag."""
+    found = []
+    for process in Path('/proc').glob('[0-9]*'):
+        try:
+            if f'{TAG}={out}'.encode() in (process / 'environ').read_bytes():
+                found.append((process / 'cmdline').read_text().replace('\0', ' '))
+        except OSError:  # ended meanwhile, or not ours
+            continue
+    return found
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    """Wait for a condition, or fail."""
+    deadline = time.monotonic() + TIMEOUT_S
+    while not condition():
+        assert time.monotonic() < deadline, 'timed out'
+        time.sleep(0.1)
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / 'demo'
+
+
+def test_the_whole_way(out: Path) -> None:
+    process = start_demo(out, 'synthetic:frames=4')
+    said, _ = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 0, said
+    metrics = json.loads((out / 'metrics.json').read_text())
+    assert metrics['tracked'] == metrics['frames'] == 4
+    assert metrics['ate_rmse_m'] < 0.005  # measured 0.2 cm; poses that all stood still would be off by 0.9 cm
+    assert {'report.png', 'map.ply', 'trajectory.txt'} <= {path.name for path in out.iterdir()}
+    assert f'{out}/report.png' in said
+    assert not alive(out)
+    remove_previous(out)  # what the next run does first
+    assert not out.exists()
+
+
+@pytest.mark.parametrize('name', ['demo', 'demo-input'])
+def test_what_somebody_else_made_is_left_alone(out: Path, name: str) -> None:
+    precious = out.with_name(name) / 'thesis.txt'
+    precious.parent.mkdir()
+    precious.touch()
+    process = start_demo(out, 'synthetic:frames=4')
+    said, _ = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 1
+    assert said.splitlines() == [
+        f'demo: {precious.parent} exists and was not made by the demo: move it away, or choose another --out'
+    ]
+    assert precious.exists()
+
+
+def test_a_step_that_fails_is_named(out: Path) -> None:
+    process = start_demo(out, str(out / 'nowhere'))
+    said, _ = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 1
+    assert 'no such file or folder' in said
+    assert said.splitlines()[-1] == "demo: 'splatam convert' ended with exit code 2; what it said is above"
+
+
+def test_a_node_that_dies_ends_the_demo_with_its_last_words(out: Path) -> None:
+    process = start_demo(out, 'synthetic:frames=30')
+    wait_until(lambda: any('splatam_bag_player' in command for command in alive(out)))
+    wait_until(lambda: (out / 'trajectory.txt').is_file())
+    node = next(
+        int(path.parent.name)
+        for path in Path('/proc').glob('[0-9]*/cmdline')
+        if f'save_path:={out}'.encode() in path.read_bytes() and b'splatam_node' in path.read_bytes()
+    )
+    os.kill(node, signal.SIGKILL)
+    said, _ = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 1
+    assert 'was killed by SIGKILL' in said
+    assert 'node.log' in said
+    assert not alive(out)
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_every_process(out: Path, number: signal.Signals) -> None:
+    process = start_demo(out, 'synthetic:frames=30')
+    wait_until(lambda: (out / 'trajectory.txt').is_file())
+    process.send_signal(number)
+    said, _ = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 130, said
+    assert said.splitlines()[-1] == 'demo: interrupted'
+    assert not alive(out)
