@@ -52,6 +52,10 @@ class PinholeCamera:
         """The intrinsic matrix K, [3, 3]."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
+    def cropped(self, width: int, height: int) -> PinholeCamera:
+        """The camera of the image's upper left corner."""
+        return PinholeCamera(width, height, self.fx, self.fy, self.cx, self.cy)
+
     def resized(self, width: int, height: int) -> PinholeCamera:
         """The camera of the same image resampled to another size."""
         sx, sy = width / self.width, height / self.height

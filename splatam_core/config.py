@@ -99,7 +99,13 @@ class DepthConfig:
 class TrackingConfig:
     """Camera tracking (paper, section 3.2), and when to call a frame lost."""
 
-    iterations: int = _setting(40, 'Optimisation steps per frame.', '', 0)
+    method: str = _setting(
+        'render_and_compare',
+        "The paper's Adam through the renderer, or Gauss-Newton alignment to one render.",
+        choices=('render_and_compare', 'align'),
+    )
+    iterations: int = _setting(40, 'Steps per frame; of alignment, at most per resolution.', '', 0)
+    renders: int = _setting(1, 'Of alignment: how often to render anew and align again.', '', 1)
     rotation_rate: float = _setting(4e-4, 'Adam step of the unit quaternion.', '', 0.0)
     translation_rate: float = _setting(2e-3, 'Adam step of the translation.', 'm', 0.0)
     color_weight: float = _setting(0.5, 'Weight of the colour L1.', '', 0.0)
@@ -130,6 +136,9 @@ class DensificationConfig:
         50.0, 'Also add where the reading is in front of the map by more than this many median errors.', '', 0.0
     )
     opacity: float = _setting(0.5, 'Opacity of a new Gaussian.', '', 0.01, 0.99)
+    settle: int = _setting(
+        0, 'Rounds that move new Gaussians along their rays until the rendered depth meets the reading.', '', 0
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import math
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
 from splatam_core.config import DensificationConfig
-from splatam_core.rasterizer import Gaussians, Rasterizer, Render
-from splatam_core.view import View
+from splatam_core.rasterizer import Gaussians, Rasterizer, Render, joined
+from splatam_core.view import View, unproject
+
+MAX_BIAS = 0.1  # share of the depth; pixels that are farther off see another surface
+BIAS_WINDOW = 5  # pixels
 
 
 def densify(
@@ -19,7 +24,29 @@ def densify(
     view = view.scaled(config.scale)
     with torch.no_grad():
         render = rasterizer.render(gaussians.detached(), view.camera, T_cam_world)
-    return new_gaussians(view, unexplained(render, view, config), T_cam_world, config.opacity)
+        chosen = unexplained(render, view, config)
+        depth = view.depth
+        new = new_gaussians(view, chosen, depth, T_cam_world, config.opacity)
+        for _ in range(config.settle):
+            render = rasterizer.render(joined(gaussians.detached(), new), view.camera, T_cam_world)
+            depth = depth - depth_bias(render, view)
+            new = new_gaussians(view, chosen, depth, T_cam_world, config.opacity)
+    return new
+
+
+def depth_bias(render: Render, view: View) -> Tensor:
+    """[H, W] metres by which the rendered depth is off, averaged over each pixel's surroundings.
+
+    Blending front to back favours the nearer neighbours, so on slanted or noisy surfaces a fresh map renders too near.
+    Only the average is of interest: a pixel's own error is mostly noise, and following it would add to it.
+    """
+    depth = render.depth()
+    compared = (view.valid & (depth > 0) & ((depth - view.depth).abs() < MAX_BIAS * view.depth)).float()
+    error, weight = (
+        cv2.boxFilter(image.numpy(), -1, (BIAS_WINDOW, BIAS_WINDOW), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for image in (compared * (depth - view.depth), compared)
+    )
+    return torch.from_numpy(error / np.maximum(weight, 1))
 
 
 def unexplained(render: Render, view: View, config: DensificationConfig) -> Tensor:
@@ -37,14 +64,15 @@ def unexplained(render: Render, view: View, config: DensificationConfig) -> Tens
     return (unmapped | in_front) & view.valid
 
 
-def new_gaussians(view: View, chosen: Tensor, T_cam_world: Tensor, opacity: float) -> Gaussians:
-    """One Gaussian per chosen pixel [H, W], one pixel wide, of the pixel's colour."""
-    points = view.points(chosen)  # [K, 3]
+def new_gaussians(view: View, chosen: Tensor, depth: Tensor, T_cam_world: Tensor, opacity: float) -> Gaussians:
+    """One Gaussian per chosen pixel [H, W] at a depth [H, W], one pixel wide, of the pixel's colour."""
+    v, u = torch.nonzero(chosen, as_tuple=True)
+    points = unproject(view.camera, u, v, depth[v, u])  # [K, 3]
     R, t = T_cam_world[:3, :3], T_cam_world[:3, 3]
     focal = (view.camera.fx + view.camera.fy) / 2
     return Gaussians(
         means=(points - t) @ R,
         log_scales=torch.log(points[:, 2:] / focal),
         logit_opacities=torch.full((len(points),), math.log(opacity / (1 - opacity))),
-        rgb=view.rgb[:, chosen].T.contiguous(),
+        rgb=view.rgb[:, v, u].T.contiguous(),
     )

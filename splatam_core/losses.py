@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -14,14 +15,33 @@ from splatam_core.view import View
 _WINDOW = cv2.getGaussianKernel(11, 1.5)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackingLoss:
+    """How far a pose is from explaining a view.
+
+    Attributes:
+        total: sum over the pixels that count, differentiable.
+        num_pixels: how many count.
+    """
+
+    total: Tensor
+    num_pixels: int
+
+
 def tracking_loss(
     render: Render, view: View, silhouette_threshold: float, color_weight: float, depth_weight: float
-) -> Tensor:
+) -> TrackingLoss:
     """Summed L1 of depth and colour where the map is sure and the sensor has a reading (paper, eq. 8)."""
-    mask = ((render.silhouette.detach() > silhouette_threshold) & view.valid).to(view.rgb.dtype)
-    depth = ((render.depth_acc - view.depth).abs() * mask).sum()
+    counts = (render.silhouette.detach() > silhouette_threshold) & view.valid
+    mask = counts.to(view.rgb.dtype)
+    depth = ((expected_depth(render) - view.depth).abs() * mask).sum()
     color = ((render.rgb - view.rgb).abs() * mask).sum()
-    return depth_weight * depth + color_weight * color
+    return TrackingLoss(depth_weight * depth + color_weight * color, int(counts.sum()))
+
+
+def expected_depth(render: Render) -> Tensor:
+    """[H, W] metres; where little or no map is seen it fades to 0, differentiably."""
+    return render.depth_acc / render.silhouette.clamp(min=0.5)
 
 
 def mapping_loss(render: Render, view: View, ssim_weight: float, color_weight: float, depth_weight: float) -> Tensor:

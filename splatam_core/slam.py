@@ -19,7 +19,7 @@ from splatam_core.keyframes import PosedView, select_window
 from splatam_core.mapping import refine
 from splatam_core.motion import MotionModel
 from splatam_core.rasterizer import make_rasterizer
-from splatam_core.tracking import RenderAndCompareTracker
+from splatam_core.tracking import make_tracker
 from splatam_core.types import FrameResult, MapSnapshot, RenderedView, RgbdFrame, StageTimings, Status
 from splatam_core.view import View
 
@@ -32,7 +32,7 @@ class Slam:
     def __init__(self, config: SlamConfig) -> None:
         self.config = config
         self._rasterizer = make_rasterizer(config.rasterizer, config.threads)
-        self._tracker = RenderAndCompareTracker(self._rasterizer, config.tracking)
+        self._tracker = make_tracker(self._rasterizer, config.tracking)
         self.reset()
 
     def reset(self) -> None:

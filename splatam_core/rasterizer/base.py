@@ -9,7 +9,7 @@ Centres at z <= 0.2 m are not drawn. The background is black. Where alpha is cla
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import torch
@@ -48,6 +48,11 @@ class Gaussians:
         return Gaussians(
             self.means.detach(), self.log_scales.detach(), self.logit_opacities.detach(), self.rgb.detach()
         )
+
+
+def joined(first: Gaussians, second: Gaussians) -> Gaussians:
+    """Both, the first's before the second's."""
+    return Gaussians(*(torch.cat([getattr(g, f.name) for g in (first, second)]) for f in fields(Gaussians)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

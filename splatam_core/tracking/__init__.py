@@ -1,6 +1,18 @@
 """Trackers: (frame, map, first guess of the pose) in, pose and how far to trust it out."""
 
+from __future__ import annotations
+
+from splatam_core.config import TrackingConfig
+from splatam_core.rasterizer import Rasterizer
+from splatam_core.tracking.align import AlignmentTracker
 from splatam_core.tracking.base import Tracker, TrackingResult
 from splatam_core.tracking.render_and_compare import RenderAndCompareTracker
 
-__all__ = ['RenderAndCompareTracker', 'Tracker', 'TrackingResult']
+__all__ = ['AlignmentTracker', 'RenderAndCompareTracker', 'Tracker', 'TrackingResult', 'make_tracker']
+
+_TRACKERS = {'render_and_compare': RenderAndCompareTracker, 'align': AlignmentTracker}
+
+
+def make_tracker(rasterizer: Rasterizer, config: TrackingConfig) -> Tracker:
+    """The tracker that the configuration names."""
+    return _TRACKERS[config.method](rasterizer, config)

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from splatam_core.config import TrackingConfig
+from splatam_core.losses import TrackingLoss, tracking_loss
 from splatam_core.rasterizer import Gaussians, Render
 from splatam_core.view import View
 
@@ -37,6 +38,38 @@ class Tracker(Protocol):
     def track(self, view: View, gaussians: Gaussians, T_cam_world: NDArray[np.float64]) -> TrackingResult:
         """Find the pose from which the map looks like the view, from a first guess; changes nothing."""
         ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A pose a tracker considers.
+
+    The loss alone cannot say which pose is best: one that sees less of the map sums over fewer pixels. So a pixel with
+    a reading that sees no sure map is taken to be as wrong as the average pixel was at the first guess.
+
+    Attributes:
+        T_cam_world: [4, 4] float64.
+        render: the map from there, without gradients.
+        cost: the lower, the better it explains the view.
+        mean_error: average loss of the pixels that counted, at the first guess.
+    """
+
+    T_cam_world: NDArray[np.float64]
+    render: Render
+    cost: float
+    mean_error: float
+
+    @classmethod
+    def of(
+        cls, T_cam_world: NDArray[np.float64], render: Render, view: View, config: TrackingConfig,
+        guess: Candidate | None, loss: TrackingLoss | None = None,
+    ) -> Candidate:  # fmt: skip
+        """Weigh a pose against the first guess, or the first guess itself where there is none yet."""
+        if loss is None:
+            loss = tracking_loss(render, view, config.silhouette_threshold, config.color_weight, config.depth_weight)
+        total, readings = loss.total.item(), int(view.valid.sum())
+        mean_error = guess.mean_error if guess else total / max(1, loss.num_pixels)
+        return cls(T_cam_world, render, total + mean_error * (readings - loss.num_pixels), mean_error)
 
 
 def judge(T_cam_world: NDArray[np.float64], render: Render, view: View, config: TrackingConfig) -> TrackingResult:

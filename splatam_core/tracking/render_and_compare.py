@@ -11,12 +11,12 @@ from splatam_core import se3
 from splatam_core.config import TrackingConfig
 from splatam_core.losses import tracking_loss
 from splatam_core.rasterizer import Gaussians, Rasterizer
-from splatam_core.tracking.base import TrackingResult, judge
+from splatam_core.tracking.base import Candidate, TrackingResult, judge
 from splatam_core.view import View
 
 
 class RenderAndCompareTracker:
-    """Keeps the pose with the lowest loss of all it evaluated, the first guess included."""
+    """Keeps the best pose of all it evaluated, the first guess included."""
 
     def __init__(self, rasterizer: Rasterizer, config: TrackingConfig) -> None:
         self._rasterizer = rasterizer
@@ -33,20 +33,21 @@ class RenderAndCompareTracker:
                 {'params': [translation.requires_grad_()], 'lr': config.translation_rate},
             ]
         )
-        best_loss, best_pose, best_render = float('inf'), _pose(rotation, translation).detach(), None
+        guess: Candidate | None = None
         for step in range(config.iterations + 1):
             pose = _pose(rotation, translation)
             render = self._rasterizer.render(gaussians, view.camera, pose)
-            loss = tracking_loss(
-                render, view, config.silhouette_threshold, config.color_weight, config.depth_weight
-            )
-            if best_render is None or loss.item() < best_loss:
-                best_loss, best_pose, best_render = loss.item(), pose.detach(), render
+            loss = tracking_loss(render, view, config.silhouette_threshold, config.color_weight, config.depth_weight)
+            candidate = Candidate.of(_float64(pose.detach()), render, view, config, guess, loss)
+            if guess is None:
+                guess = best = candidate
+            elif candidate.cost < best.cost:
+                best = candidate
             if step < config.iterations:
                 optimizer.zero_grad()
-                loss.backward()
+                loss.total.backward()
                 optimizer.step()
-        return judge(_float64(best_pose), best_render, view, config)
+        return judge(best.T_cam_world, best.render, view, config)
 
 
 def _pose(quaternion: Tensor, translation: Tensor) -> Tensor:

@@ -29,7 +29,8 @@ def test_tracking_loss_sums_where_the_map_is_sure_and_depth_is_read() -> None:
     silhouette[:, :3] = 1.0
     loss = tracking_loss(_render(0.6, 2.3, silhouette), _view(), 0.99, 0.5, 1.0)
     pixels = 3 * 3  # three columns sure, three rows with depth
-    assert float(loss) == pytest.approx(pixels * (1.0 * 0.3 + 0.5 * 3 * 0.1), rel=1e-5)
+    assert loss.num_pixels == pixels
+    assert float(loss.total) == pytest.approx(pixels * (1.0 * 0.3 + 0.5 * 3 * 0.1), rel=1e-5)
 
 
 def test_mapping_loss_means_depth_over_readings_and_colour_over_all() -> None:

@@ -32,7 +32,7 @@ def _view(depth_m: float = 2.0) -> View:
 
 def _map(view: View) -> GaussianMap:
     result = GaussianMap()
-    result.append(new_gaussians(view, view.valid, EYE, 0.5))
+    result.append(new_gaussians(view, view.valid, view.depth, EYE, 0.5))
     return result
 
 
@@ -48,7 +48,7 @@ def _at(x: float, turn: float = 0.0) -> torch.Tensor:
 def test_new_gaussians_lie_on_their_pixels() -> None:
     """Position, width of one pixel, colour, opacity; from a moved camera."""
     view, T = _view(), _at(0.3, 0.2)
-    gaussians = new_gaussians(view, view.valid, T, 0.5)
+    gaussians = new_gaussians(view, view.valid, view.depth, T, 0.5)
     camera = gaussians.means @ T[:3, :3].T + T[:3, 3]
     u = CAMERA.fx * camera[:, 0] / camera[:, 2] + CAMERA.cx
     torch.testing.assert_close(u.view(24, 32)[7], torch.arange(32.0), atol=1e-4, rtol=0)  # float32 at 32 px
@@ -75,7 +75,7 @@ def test_densification_adds_unmapped_pixels_with_a_reading() -> None:
     unseen = view.valid.clone()
     unseen[:, 16:] = False
     half = GaussianMap()
-    half.append(new_gaussians(view, unseen, EYE, 0.5))
+    half.append(new_gaussians(view, unseen, view.depth, EYE, 0.5))
     added = densify(half.gaussians, view, EYE, make_rasterizer('cpu', 1), DensificationConfig())
     u = CAMERA.fx * added.means[:, 0] / added.means[:, 2] + CAMERA.cx
     assert 24 * 13 <= len(added) <= 24 * 16
@@ -103,6 +103,21 @@ def test_densification_at_half_resolution_adds_a_quarter_of_wider_gaussians() ->
     added = densify(empty.gaussians, view, EYE, make_rasterizer('cpu', 1), DensificationConfig(scale=0.5))
     assert len(added) == 24 * 32 // 4
     torch.testing.assert_close(added.log_scales.exp(), torch.full((192, 1), 2.0 / 15.0))
+
+
+def test_settled_gaussians_render_at_the_depth_they_were_read_at() -> None:
+    """On a floor seen at a grazing angle, blending front to back favours the nearer neighbours; settling undoes that."""
+    v = torch.arange(24.0)[:, None].expand(24, 32)
+    depth = (1.0 / (0.3 + 0.01 * v)).contiguous()  # a plane: inverse depth is linear in the image
+    view = View(CAMERA, torch.full((3, 24, 32), 0.5), depth, depth > 0)
+    rasterizer = make_rasterizer('cpu', 1)
+    bias = []
+    for rounds in (0, 3):
+        fresh = densify(GaussianMap().gaussians, view, EYE, rasterizer, DensificationConfig(settle=rounds))
+        render = rasterizer.render(fresh, CAMERA, EYE)
+        bias.append(float((render.depth() - depth)[4:-4, 4:-4].mean()))
+    assert bias[0] < -0.01
+    assert abs(bias[1]) < 0.2 * abs(bias[0])
 
 
 def test_mapping_makes_the_render_look_like_the_view() -> None:

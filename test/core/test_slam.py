@@ -1,0 +1,247 @@
+"""The whole algorithm on the synthetic room, whose poses are known exactly."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import torch
+
+from splatam_core import se3
+from splatam_core.camera import PinholeCamera
+from splatam_core.config import TrackingConfig, load_config
+from splatam_core.datasets import open_sequence
+from splatam_core.errors import FrameError, SplatamError
+from splatam_core.motion import MotionModel
+from splatam_core.rasterizer import make_rasterizer
+from splatam_core.slam import Slam
+from splatam_core.tracking import make_tracker
+from splatam_core.types import FrameResult, RgbdFrame, Status
+from splatam_core.view import View
+
+WIDTH = 96  # a frame then takes some 50 ms
+
+
+@pytest.fixture(scope='module')
+def room() -> tuple[list[RgbdFrame], list[np.ndarray]]:
+    """Ten frames and their true poses relative to the first."""
+    sequence = open_sequence('synthetic', width=WIDTH, max_frames=10)
+    truth = sequence.ground_truth().T_world_cam[:10]
+    return [sequence[i] for i in range(10)], [se3.inverse(truth[0]) @ T for T in truth]
+
+
+def _slam(*overrides: str) -> Slam:
+    return Slam(load_config('quick', ['threads=1', *overrides]))
+
+
+def _covered(frame: RgbdFrame, stamp_ns: int) -> RgbdFrame:
+    """A hand on the lens: dark, and nothing but very near readings."""
+    return dataclasses.replace(
+        frame, stamp_ns=stamp_ns, rgb=np.zeros_like(frame.rgb), depth_m=np.full_like(frame.depth_m, 0.3)
+    )
+
+
+def test_tracks_every_frame_of_the_room(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """Within 1 cm and 0.5 degrees: at 96 pixels width one pixel is 2 cm at the walls' 2.5 m, and depth noise is 1 cm."""
+    frames, truth = room
+    slam = _slam()
+    results = [slam.process(frame) for frame in frames]
+    assert [r.status for r in results] == [Status.INITIALIZED] + [Status.TRACKED] * 9
+    assert [r.index for r in results] == list(range(10))
+    assert [r.is_keyframe for r in results] == [i % 5 == 0 for i in range(10)]
+    for result, T in zip(results, truth, strict=True):
+        error = se3.inverse(T) @ result.T_world_cam
+        assert np.linalg.norm(error[:3, 3]) < 0.01
+        assert np.degrees(np.linalg.norm(se3.rotation_vector(error[:3, :3]))) < 0.5
+
+
+def test_the_map_renders_like_the_frames(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """The render of a mapped view resembles it, in colour and depth."""
+    frames, _ = room
+    slam = _slam()
+    results = [slam.process(frame) for frame in frames]
+    view = slam.render(results[4].T_world_cam)
+    read = frames[4].depth_m > 0
+    mse = np.mean((view.rgb[read] / 255.0 - frames[4].rgb[read] / 255.0) ** 2)
+    assert 10 * np.log10(1 / mse) > 22
+    assert np.median(np.abs(view.depth_m[read] - frames[4].depth_m[read])) < 0.03
+    assert view.silhouette[read].mean() > 0.95
+
+
+def _signature(slam: Slam, results: Sequence[FrameResult]) -> list[np.ndarray]:
+    snapshot = slam.snapshot()
+    return [*(r.T_world_cam for r in results), snapshot.means, snapshot.rgb, snapshot.opacities, snapshot.log_scales]
+
+
+def test_one_thread_and_a_seed_repeat_bit_for_bit(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """Poses and map; also after a reset."""
+    frames, _ = room
+    first = _slam()
+    runs = [_signature(first, [first.process(frame) for frame in frames[:6]])]
+    second = _slam()
+    runs.append(_signature(second, [second.process(frame) for frame in frames[:6]]))
+    second.reset()
+    runs.append(_signature(second, [second.process(frame) for frame in frames[:6]]))
+    for run in runs[1:]:
+        assert all(np.array_equal(a, b) for a, b in zip(runs[0], run, strict=True))
+
+
+def test_covered_camera_is_lost_leaves_the_map_alone_and_recovers(
+    room: tuple[list[RgbdFrame], list[np.ndarray]],
+) -> None:
+    """Never silently wrong: no pose, no change; and back to tracking once the view returns."""
+    frames, truth = room
+    slam = _slam()
+    for frame in frames[:5]:
+        slam.process(frame)
+    before = slam.snapshot()
+    results = [slam.process(_covered(frames[5], frames[4].stamp_ns + k)) for k in (1000, 2000, 3000)]
+    after = slam.snapshot()
+    assert all(r.status is Status.LOST and r.T_world_cam is None and r.reason for r in results)
+    assert np.array_equal(before.means, after.means) and np.array_equal(before.rgb, after.rgb)
+    back = slam.process(frames[5])
+    assert back.status is Status.TRACKED
+    assert np.linalg.norm(back.T_world_cam[:3, 3] - truth[5][:3, 3]) < 0.02  # from the last pose, not a prediction
+
+
+def test_frames_without_depth_are_lost_and_do_not_start_a_map(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    frames, _ = room
+    slam = _slam()
+    blind = dataclasses.replace(frames[0], depth_m=np.zeros_like(frames[0].depth_m))
+    first = slam.process(blind)
+    assert first.status is Status.LOST and 'depth' in first.reason and slam.num_gaussians == 0
+    assert slam.process(frames[1]).status is Status.INITIALIZED
+    later = dataclasses.replace(blind, stamp_ns=frames[2].stamp_ns)
+    assert 'no pixel has a usable depth reading' in slam.process(later).reason
+
+
+def test_a_view_of_somewhere_else_is_lost(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """Another room: plenty of readings, none of them agrees."""
+    frames, _ = room
+    slam = _slam()
+    for frame in frames[:3]:
+        slam.process(frame)
+    stranger = open_sequence('synthetic:seed=5', width=WIDTH)[150]
+    result = slam.process(dataclasses.replace(stranger, stamp_ns=frames[3].stamp_ns))
+    assert result.status is Status.LOST, (result.sure_fraction, result.inlier_fraction)
+
+
+def test_frames_it_cannot_take_are_refused_and_change_nothing(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    frames, _ = room
+    slam = _slam()
+    slam.process(frames[1])
+    other = dataclasses.replace(frames[2], camera=PinholeCamera(96, 72, 90.0, 90.0, 47.5, 35.5))
+    with pytest.raises(FrameError, match='camera changed'):
+        slam.process(other)
+    for late in (frames[0], frames[1]):
+        with pytest.raises(FrameError, match='not after the last one'):
+            slam.process(late)
+    assert slam.process(frames[2]).status is Status.TRACKED
+
+
+def test_rendering_before_the_first_frame_says_so() -> None:
+    with pytest.raises(SplatamError, match='before the first frame'):
+        _slam().render(np.eye(4))
+
+
+def test_reference_and_cpu_rasterizers_run_the_same_slam() -> None:
+    """Two frames at 32 pixels: poses agree to float32's rounding, amplified by a few Adam steps."""
+    sequence = open_sequence('synthetic', width=32, max_frames=2)
+    poses = []
+    for backend in ('cpu', 'reference'):
+        slam = _slam(f'rasterizer={backend}', 'tracking.iterations=5', 'mapping.iterations=3')
+        poses.append([slam.process(sequence[i]).T_world_cam for i in range(2)][1])
+    np.testing.assert_allclose(poses[0], poses[1], atol=1e-4)
+
+
+def test_timings_add_up(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    frames, _ = room
+    timings = _slam().process(frames[0]).timings
+    stages = timings.track + timings.densify + timings.keyframes + timings.map
+    assert 0 < stages <= timings.total
+
+
+@pytest.mark.parametrize(
+    ('tracking', 'metres', 'radians'),
+    [
+        # Adam moves rotation and translation by fixed steps and lets one stand in for the other for long.
+        (TrackingConfig(method='render_and_compare', iterations=200, rotation_rate=1e-3), 0.008, 0.003),
+        # Gauss-Newton tells them apart; what remains is a fraction of a pixel, here 2 cm.
+        (TrackingConfig(method='align', iterations=6), 0.004, 0.002),
+    ],
+)
+def test_trackers_find_a_known_motion(
+    tracking: TrackingConfig, metres: float, radians: float, room: tuple[list[RgbdFrame], list[np.ndarray]]
+) -> None:
+    """From a guess 2 cm and 1 degree off."""
+    frames, _ = room
+    slam = _slam('mapping.iterations=30')
+    slam.process(frames[0])
+    tracker = make_tracker(make_rasterizer('cpu', 1), tracking)
+    view = View.from_frame(frames[0], slam.config.depth)
+    off = se3.exp(np.array([0.015, -0.01, 0.008, 0.01, -0.012, 0.008]))
+    result = tracker.track(view, slam.map.gaussians, off)
+    assert not result.failure
+    assert np.linalg.norm(result.T_cam_world[:3, 3]) < metres
+    assert np.linalg.norm(se3.rotation_vector(result.T_cam_world[:3, :3])) < radians
+
+
+def test_tracking_never_returns_a_pose_worse_than_its_guess(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """The guess itself is a candidate: absurd step sizes cannot spoil a perfect one."""
+    frames, _ = room
+    slam = _slam('mapping.iterations=30')
+    slam.process(frames[0])
+    wild = TrackingConfig(iterations=5, rotation_rate=0.3, translation_rate=0.5)
+    view = View.from_frame(frames[0], slam.config.depth)
+    result = make_tracker(make_rasterizer('cpu', 1), wild).track(view, slam.map.gaussians, np.eye(4))
+    np.testing.assert_allclose(result.T_cam_world, np.eye(4), atol=1e-6)
+
+
+def test_tracking_leaves_the_map_alone(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    frames, _ = room
+    slam = _slam()
+    slam.process(frames[0])
+    before = slam.snapshot()
+    make_tracker(make_rasterizer('cpu', 1), TrackingConfig(iterations=3)).track(View.from_frame(frames[1], slam.config.depth), slam.map.gaussians, np.eye(4))
+    assert np.array_equal(before.means, slam.snapshot().means)
+    assert slam.map.means.grad is None
+
+
+def test_motion_is_carried_on_by_stamps() -> None:
+    """A dropped frame doubles the step; a lost camera's velocity is forgotten."""
+    step = np.array([0.02, 0.0, 0.01, 0.0, 0.03, 0.0])
+    motion = MotionModel(constant_velocity=True)
+    start = se3.exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
+    motion.observe(1_000_000_000, start)
+    motion.observe(1_033_000_000, start @ se3.exp(step))
+    np.testing.assert_allclose(motion.predict(1_099_000_000), start @ se3.exp(3 * step), atol=1e-9)
+    motion.stop()
+    np.testing.assert_allclose(motion.predict(1_099_000_000), start @ se3.exp(step), atol=1e-12)
+
+
+def test_last_pose_model_stays() -> None:
+    motion = MotionModel(constant_velocity=False)
+    motion.observe(1, np.eye(4))
+    motion.observe(2, se3.exp(np.array([0.1, 0, 0, 0, 0, 0])))
+    np.testing.assert_array_equal(motion.predict(3), motion.last_pose)
+
+
+@pytest.mark.parametrize('ratio', [0.0, 0.05])
+def test_depth_edge_filter(ratio: float, room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """Drops the readings beside a step, and none on a gentle slope."""
+    frames, _ = room
+    depth = np.tile(np.linspace(1.0, 1.2, WIDTH, dtype=np.float32), (72, 1))
+    depth[:, 40:] += 1.0
+    frame = dataclasses.replace(frames[0], depth_m=depth)
+    config = load_config('quick', {'depth.edge_filter': ratio}).depth
+    dropped = ~View.from_frame(frame, config).valid
+    assert torch.nonzero(dropped.any(dim=0))[:, 0].tolist() == ([39, 40] if ratio else [])
+
+
+def test_depth_range() -> None:
+    depth = np.array([[0.1, 0.5, 3.0, 9.0]], np.float32)
+    frame = RgbdFrame(1, np.zeros((1, 4, 3), np.uint8), depth, PinholeCamera(4, 1, 4.0, 4.0, 1.5, 0.0))
+    config = load_config('quick', {'depth.min_m': 0.4, 'depth.max_m': 4.0}).depth
+    assert View.from_frame(frame, config).valid.tolist() == [[False, True, True, False]]
