@@ -35,7 +35,7 @@ $(VENV)/.created:
 $(VENV)/.native: $(CSRC) setup.py package.xml constraints.txt | $(VENV)/.created
 	@echo 'building the kernels'
 	$(BIN)/python -m pip install --quiet -c constraints.txt setuptools pybind11
-	$(BIN)/python setup.py --quiet build_ext --inplace
+	$(BIN)/python setup.py --quiet build_ext --inplace --force
 	touch $@
 
 $(VENV)/.installed: setup.py package.xml pyproject.toml constraints.txt $(VENV)/.native
@@ -51,19 +51,19 @@ demo: setup
 
 # A ROS workspace as colcon sees it, outside the checkout; its virtual environment does not hold splatam_ros.
 colcon: $(VENV)/.created
-	@workspace=$$(mktemp -d)
-	trap 'rm -rf $$workspace' EXIT
-	package=$$workspace/src/splatam_ros
-	mkdir -p $$package
-	git ls-files -z --cached --others --exclude-standard | xargs -0 cp --parents -t $$package
-	$(BIN)/python -m venv $$workspace/venv
-	export PATH=$$workspace/venv/bin:$$PATH AMENT_PREFIX_PATH=$$workspace/venv CMAKE_PREFIX_PATH=$$workspace/venv
+	@scratch=$$(mktemp -d)
+	trap 'rm -rf "$$scratch"' EXIT
+	venv=$$scratch/venv package=$$scratch/workspace/src/splatam_ros
+	mkdir -p "$$package"
+	git ls-files -z --cached --others --exclude-standard | xargs -0 cp --parents -t "$$package"
+	$(BIN)/python -m venv "$$venv"
+	export PATH=$$venv/bin:$$PATH AMENT_PREFIX_PATH=$$venv CMAKE_PREFIX_PATH=$$venv
 	echo 'installing colcon and what splatam_ros needs: some minutes'
 	pip install --quiet -c constraints.txt "$$package[ros,test]" pybind11
 	pip uninstall --quiet --yes splatam_ros
 	pip install --quiet colcon-common-extensions
-	rm -rf $$package/build $$package/*.egg-info
-	cd $$workspace
+	rm -rf "$$package"/build "$$package"/*.egg-info
+	cd "$$scratch/workspace"
 	colcon build
 	colcon test --return-code-on-test-failure
 	colcon test-result --all

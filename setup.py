@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import shlex
 import shutil
 import sys
@@ -53,13 +54,18 @@ def missing_for_build() -> str | None:
 
 
 class BuildNative(build_ext):
-    """Builds the kernels, once everything they need is there."""
+    """Builds the kernels, once everything they need is there, and leaves them beside their source too.
+
+    The checkout itself can then be run and tested, which is what ``colcon test`` does.
+    """
 
     def run(self) -> None:
         """Build, or leave with one line that says what to install."""
         if missing := missing_for_build():
             sys.exit(f'{NAME}: {missing}')
         super().run()
+        if not self.inplace and platform.machine() in self.plat_name:  # else it is built for another processor
+            self.copy_extensions_to_source()
 
 
 def native_extension() -> Extension:

@@ -344,3 +344,7 @@ COMMANDS = (
     Command('evaluate', 'score a run and draw its report', _add_evaluate_arguments, evaluate),
     Command('convert', 'write a recording as a rosbag2', _add_convert_arguments, convert),
 )
+
+
+if __name__ == '__main__':
+    sys.exit(main())

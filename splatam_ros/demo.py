@@ -23,6 +23,11 @@ SCENE = 'synthetic'
 SCENE_FRAMES = 100
 WIDTH = 320
 MARKER = '.demo'
+COMMANDS = {
+    'splatam': 'splatam_core.cli',
+    'splatam_node': 'splatam_ros.main',
+    'splatam_bag_player': 'splatam_ros.bag_player',
+}
 FINISH_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 20.0
 LOG_LINES = 15
@@ -47,7 +52,7 @@ class Processes:
         print(f'$ {shlex.join(command)}' + (f' &> {log}' if log else ''), flush=True)
         with log.open('wb') if log else nullcontext() as output:
             process = subprocess.Popen(
-                [Path(sys.executable).with_name(command[0]), *command[1:]],
+                [sys.executable, '-m', COMMANDS[command[0]], *command[1:]],
                 env=self._environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True,
             )  # fmt: skip
         self._started.append(process)
