@@ -314,7 +314,13 @@ def _unknown(name: str, known: Mapping[str, Setting]) -> str:
 
 
 def apply_threads(config: SlamConfig) -> None:
-    """Give torch as many threads as the configuration says. For whoever owns the process, once."""
+    """Keep the libraries within the configured threads. For whoever owns the process, once.
+
+    The rasterizer threads itself. Torch gets one thread: its pool spins while it waits, so on cores that others use
+    too its many small operations take several times as long with two threads as with one.
+    """
+    import cv2
     import torch
 
-    torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
+    torch.set_num_threads(1)
+    cv2.setNumThreads(config.threads or len(os.sched_getaffinity(0)))

@@ -58,6 +58,7 @@ RGB_TOPIC, DEPTH_TOPIC, INFO_TOPIC, TRUTH_TOPIC = '/rgb/image', '/depth/image', 
 CAMERA_FRAME, WORLD_FRAME = 'camera_optical_frame', 'world'
 
 MAX_INTERVAL_NS = 20_000_000
+QUEUE_SIZE = 300  # ten seconds of one stream before the other begins
 JUMP_NS = 1_000_000_000
 MILLIMETRES = 1000.0
 DEPTH_ENCODINGS = ('16UC1', 'mono16', '32FC1')
@@ -335,7 +336,7 @@ def _calibration(bag: _Bag, index: _Index) -> CameraCalibration:
 def _pairs(bag: _Bag, chosen: dict[str, str], index: _Index) -> list[RgbdSet]:
     """Colour and depth messages, by their numbers, that belong together."""
     pairing = RgbdSynchronizer(
-        mode='approximate', max_interval_ns=MAX_INTERVAL_NS, queue_size=len(index.entries), jump_ns=JUMP_NS
+        mode='approximate', max_interval_ns=MAX_INTERVAL_NS, queue_size=QUEUE_SIZE, jump_ns=JUMP_NS
     )
     pairing.add_info(index.entries[0].stamp_ns if index.entries else 0, None)  # one camera, known beforehand
     counts = {'rgb': 0, 'depth': 0}
