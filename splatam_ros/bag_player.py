@@ -12,7 +12,7 @@ from rclpy.node import Node
 from splatam_core.errors import SplatamError
 from splatam_ros.keyboard import Keyboard
 from splatam_ros.player import Interrupted, Options, PlaybackError, Player
-from splatam_ros.process import RosError, StopRequest, own_arguments, ros
+from splatam_ros.process import RosError, StopRequest, ros, split_arguments
 from splatam_ros.recording import Recording
 
 PROGRAM = 'splatam_bag_player'
@@ -90,14 +90,14 @@ def make_options(args: argparse.Namespace, recording: Recording) -> Options:
     )
 
 
-def play(args: argparse.Namespace, arguments: Sequence[str], stop: StopRequest) -> None:
+def play(args: argparse.Namespace, for_ros: Sequence[str], stop: StopRequest) -> None:
     """Open, play, close.
 
     Raises:
         SplatamError: what went wrong.
         Interrupted: by a signal.
     """
-    with Recording(args.bag) as recording, ros(arguments), Keyboard() as keyboard:
+    with Recording(args.bag) as recording, ros(for_ros), Keyboard() as keyboard:
         options = make_options(args, recording)
         for name, reason in recording.skipped.items():
             _complain(f'warning: {name} is left out: {reason}')
@@ -110,10 +110,11 @@ def play(args: argparse.Namespace, arguments: Sequence[str], stop: StopRequest) 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Play a recording; returns the exit code."""
-    arguments = list(sys.argv if arguments is None else [PROGRAM, *arguments])
+    own, for_ros = split_arguments(sys.argv[1:] if arguments is None else arguments)
+    args = make_parser().parse_args(own)
     with StopRequest() as stop:
         try:
-            play(make_parser().parse_args(own_arguments(arguments)), arguments, stop)
+            play(args, for_ros, stop)
         except Interrupted as interrupted:
             _complain(f'stopped by {stop.signal.name}; {interrupted}')
             return 128 + stop.signal

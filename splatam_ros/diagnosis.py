@@ -13,7 +13,7 @@ def why_no_frames(inputs: Sequence[Input], statistics: SyncStatistics, options: 
     """What to tell the user whose node gets no frames: the most basic thing that is wrong.
 
     Args:
-        inputs: colour, depth and camera info.
+        inputs: camera info, colour and depth.
         statistics: of the synchronizer.
         options: the node's.
     """
@@ -26,12 +26,14 @@ def why_no_frames(inputs: Sequence[Input], statistics: SyncStatistics, options: 
         )
     if silent := [item.topic for item in inputs if item.received == 0]:
         return f'{_and(silent)} {"is" if len(silent) == 1 else "are"} published, but no message has come'
+    if statistics.received_info == 0:
+        return 'camera info comes, but none that can be used; see the warning about it'
     if statistics.sets == 0 and statistics.newest_gap_ns is not None:
         return (
             f'colour and depth come, but nothing pairs: the stamps of the newest two are '
             f'{abs(statistics.newest_gap_ns) / 1e9:.3f} s apart, and {_allowed(options)}'
         )
-    return 'colour, depth and camera info have publishers, but nothing new comes, or nothing that can be used'
+    return 'nothing new comes, or nothing that can be used; warnings say what was left out'
 
 
 def _allowed(options: NodeOptions) -> str:

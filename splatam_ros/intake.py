@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from msg_adapters import camera_info, images, stamps
+from msg_adapters.camera_info import CameraParameters
 from msg_adapters.errors import MessageError
 from msg_adapters.synchronizer import RgbdSet, RgbdSynchronizer, SyncStatistics
 from splatam_core.camera import CameraCalibration, FrameFactory
@@ -18,7 +19,11 @@ T = TypeVar('T')
 
 
 class Intake:
-    """Turns the three streams into frames. What cannot be used is left out with a warning; nothing raises."""
+    """Turns the three streams into frames. What cannot be used is left out with a warning; nothing raises.
+
+    Attributes:
+        camera_frame: frame id of the camera of the newest frame.
+    """
 
     def __init__(self, options: NodeOptions, warnings: ThrottledWarnings) -> None:
         self.camera_frame = ''
@@ -44,8 +49,11 @@ class Intake:
         return self._frames(self._synchronizer.add_depth(stamps.message_stamp_ns(message), message))
 
     def info(self, message: Any) -> list[RgbdFrame]:
-        """Take a CameraInfo; the frames that waited for it."""
-        return self._frames(self._synchronizer.add_info(stamps.message_stamp_ns(message), message))
+        """Take a CameraInfo; the frames that waited for the first. One that makes no sense changes nothing."""
+        parameters = self._attempt('CameraInfo', camera_info.parameters, message)
+        if parameters is None:
+            return []
+        return self._frames(self._synchronizer.add_info(stamps.message_stamp_ns(message), parameters))
 
     def flush(self) -> list[RgbdFrame]:
         """The frames that can be made if nothing more comes; what has no partner is dropped."""
@@ -70,26 +78,25 @@ class Intake:
         return [frame for frame in frames if frame is not None]
 
     def _frame(self, found: RgbdSet) -> RgbdFrame | None:
-        factory = self._attempt('CameraInfo', self._frame_factory, found)
-        rgb = self._attempt('colour image', images.decode_color, found.color)
-        depth_m = self._attempt('depth image', images.decode_depth, found.depth)
+        factory = self._attempt('camera', self._frame_factory, found.info)
+        rgb = self._attempt('colour', images.decode_color, found.color)
+        depth_m = self._attempt('depth', images.decode_depth, found.depth)
         if factory is None or rgb is None or depth_m is None:
             return None
-        return self._attempt('frame', lambda _: factory.make(found.stamp_ns, rgb, depth_m), None)
+        self.camera_frame = found.info.frame_id or found.color.header.frame_id
+        return self._attempt('frame', lambda stamp_ns: factory.make(stamp_ns, rgb, depth_m), found.stamp_ns)
 
-    def _frame_factory(self, found: RgbdSet) -> FrameFactory:
-        parameters = camera_info.parameters(found.info)
+    def _frame_factory(self, parameters: CameraParameters) -> FrameFactory:
         calibration = CameraCalibration.from_intrinsics(parameters)
         if self._factory is None or self._factory.calibration != calibration:
             self._factory = FrameFactory(calibration, self._width)
-        self.camera_frame = parameters.frame_id or found.color.header.frame_id
         return self._factory
 
     def _attempt(self, what: str, function: Callable[[Any], T], argument: Any) -> T | None:
         try:
             return function(argument)
         except (MessageError, CameraError, FrameError) as error:
-            self._warnings.warn(what, f'frame left out: {what}: {error}')
+            self._warnings.warn(what, f'{what} left out: {error}')
             return None
 
 

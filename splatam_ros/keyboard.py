@@ -29,8 +29,7 @@ class Keyboard:
         return os.read(self._terminal, 1).decode(errors='ignore')
 
     def __enter__(self) -> Keyboard:
-        # A background job that touches the terminal would be stopped by the shell.
-        if sys.stdin is not None and sys.stdin.isatty() and os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp():
+        if sys.stdin is not None and sys.stdin.isatty() and not _is_background_job(sys.stdin.fileno()):
             self._terminal = sys.stdin.fileno()
             self._settings = termios.tcgetattr(self._terminal)
             tty.setcbreak(self._terminal)
@@ -41,3 +40,11 @@ class Keyboard:
     ) -> None:
         if self._terminal is not None:
             termios.tcsetattr(self._terminal, termios.TCSADRAIN, self._settings)
+
+
+def _is_background_job(terminal: int) -> bool:
+    """Whether the shell would stop us for touching the terminal."""
+    try:
+        return os.tcgetpgrp(terminal) != os.getpgrp()
+    except OSError:  # not the terminal that controls us, so nobody does
+        return False

@@ -13,7 +13,7 @@ from rclpy.impl.rcutils_logger import RcutilsLogger
 from splatam_core.errors import SplatamError
 from splatam_ros.node import SplatamNode
 from splatam_ros.parameters import NODE_SETTINGS
-from splatam_ros.process import StopRequest, own_arguments, ros
+from splatam_ros.process import StopRequest, ros, split_arguments
 
 PROGRAM = 'splatam_node'
 EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
@@ -37,13 +37,13 @@ class RosLog(logging.Handler):
             self._logger.info(record.getMessage())
 
 
-def run(arguments: Sequence[str], stop: StopRequest) -> int:
+def run(for_ros: Sequence[str], stop: StopRequest) -> int:
     """Run the node until it is finished or a signal comes; returns the exit code.
 
     Raises:
         SplatamError: the node cannot start.
     """
-    with ros(arguments):
+    with ros(for_ros):
         node = SplatamNode()
         logging.getLogger().addHandler(RosLog(node.get_logger()))
         is_fine = False
@@ -76,11 +76,11 @@ def make_parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node; returns the exit code: 0 in good order, 1 SLAM or saving failed, 2 cannot start."""
-    arguments = list(sys.argv if arguments is None else [PROGRAM, *arguments])
+    own, for_ros = split_arguments(sys.argv[1:] if arguments is None else arguments)
+    make_parser().parse_args(own)
     with StopRequest() as stop:
         try:
-            make_parser().parse_args(own_arguments(arguments))
-            return run(arguments, stop)
+            return run(for_ros, stop)
         except SplatamError as error:
             print(f'{PROGRAM}: error: {error}', file=sys.stderr)
             return EXIT_USAGE

@@ -86,10 +86,10 @@ class SplatamNode(Node):
     def _subscribe(self) -> list[Input]:
         rgb_suffix, rgb_class = TRANSPORTS[self.options.rgb_transport]
         depth_suffix, depth_class = TRANSPORTS[self.options.depth_transport]
-        streams = (
+        streams = (  # of messages that arrive together the executor takes the camera's first
+            (CameraInfo, 'rgb/camera_info', self._intake.info),
             (rgb_class, f'rgb/image{rgb_suffix}', self._intake.color),
             (depth_class, f'depth/image{depth_suffix}', self._intake.depth),
-            (CameraInfo, 'rgb/camera_info', self._intake.info),
         )
         return [
             Input(
@@ -154,7 +154,7 @@ class SplatamNode(Node):
 
     def _check_end(self, quiet_s: float) -> None:
         """Finish when a worker broke down, or the publishers have left and all of theirs is processed."""
-        has_publishers = any(item.num_publishers for item in self._inputs[:2])
+        has_publishers = any(item.num_publishers for item in self._inputs[1:])
         self._had_publishers |= has_publishers
         if self._worker.error is not None:
             self.is_finished = True

@@ -95,7 +95,7 @@ class Backlog:
             needs_depth: whether a colour image is a frame only with its depth image.
         """
         self.num_colors = 0
-        self.num_unpaired = 0
+        self._num_unpaired = 0
         self._needs_depth = needs_depth
         self._unanswered: deque[HandedOut] = deque()
         self._depths_ns: deque[int] = deque(maxlen=self.NUM_DEPTHS)
@@ -109,6 +109,11 @@ class Backlog:
     def first(self) -> HandedOut | None:
         """The first frame not answered."""
         return next((image for image in self._unanswered if image.is_complete), None)
+
+    @property
+    def num_unpaired(self) -> int:
+        """Colour images without a depth image."""
+        return self._num_unpaired + sum(not image.is_complete for image in self._unanswered)
 
     def color(self, stamp_ns: int) -> None:
         """A colour image was published."""
@@ -125,7 +130,8 @@ class Backlog:
     def answered(self, stamp_ns: int) -> None:
         """The frame of this stamp is done, and so is whatever came before it."""
         while self._unanswered and self._unanswered[0].stamp_ns <= stamp_ns:
-            self.num_unpaired += not self._unanswered.popleft().is_complete
+            image = self._unanswered.popleft()
+            self._num_unpaired += not image.is_complete and image.stamp_ns != stamp_ns
 
     def all_answered(self) -> None:
         """Everything handed out so far has arrived."""
@@ -133,6 +139,7 @@ class Backlog:
 
     def restart(self) -> None:
         """The recording starts over: old stamps say nothing about new ones."""
+        self._num_unpaired = self.num_unpaired
         self._unanswered.clear()
         self._depths_ns.clear()
 

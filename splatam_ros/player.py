@@ -105,6 +105,7 @@ class Player:
         if options.duration_s is not None:
             self._end_ns = min(self._end_ns, self._start_ns + round(options.duration_s * 1e9))
         self._clock = PlaybackClock(self._start_ns, options.rate)
+        self._clock.freeze()  # until the first message is due
         self._color: str | None = None
         self._depth: str | None = None
         self._backlog = Backlog(needs_depth=False)
@@ -245,6 +246,7 @@ class Player:
 
     def _finish(self) -> None:
         """Wait until the last frame is answered and the last message has arrived."""
+        self._clock.freeze()
         self._wait_for_answers(lambda: self._backlog.waiting == 0)
         for publisher in self._publishers.values():
             if not self._wait_until(lambda: _is_acknowledged(publisher), self._options.wait_timeout_s):  # noqa: B023
@@ -278,6 +280,8 @@ class Player:
             while not condition():
                 self._step(STEP_S)
                 if self._backlog.first is not first:
+                    if time.monotonic() - since_s < QUIET_S:
+                        self._quiet_s = QUIET_S
                     first, since_s = self._backlog.first, time.monotonic()
                 self._judge_silence(time.monotonic() - since_s)
 
@@ -287,7 +291,7 @@ class Player:
             raise PlaybackError(f'no answer {where} for {silent_s:.0f} s; {self.progress}')
         if silent_s > self._quiet_s:
             self._say(f'no answer {where} for {silent_s:.0f} s, still waiting; {self.progress}')
-            self._quiet_s *= 2
+            self._quiet_s *= 2  # a slow node is no news each time
 
     # --- one turn of the loop ---
 

@@ -10,7 +10,6 @@ from types import FrameType, TracebackType
 
 import rclpy
 from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import remove_ros_args
 
 from splatam_core.errors import SplatamError
 from splatam_core.resources import config_dir
@@ -54,16 +53,21 @@ class StopRequest:
         self.signal = self.signal or signal.Signals(number)
 
 
-def own_arguments(arguments: Sequence[str]) -> list[str]:
-    """What of a command line is not for ROS, without the program's name.
+def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """A command line in two: what is for the program, and what is for ROS, from ``--ros-args`` to ``--``.
 
-    Raises:
-        RosError: the ROS arguments cannot be parsed.
+    rcl would take every ``a:=b`` for itself, also the player's own ``--remap a:=b``.
     """
-    try:
-        return remove_ros_args(list(arguments))[1:]
-    except RuntimeError as error:
-        raise RosError(f'ROS arguments: {_first_sentence(error)}') from None
+    own: list[str] = []
+    for_ros: list[str] = []
+    current = own
+    for argument in arguments:
+        if argument == '--ros-args':
+            current = for_ros
+        current.append(argument)
+        if argument == '--' and current is for_ros:
+            current = own
+    return own, for_ros
 
 
 @contextmanager
@@ -71,14 +75,14 @@ def ros(arguments: Sequence[str]) -> Iterator[None]:
     """ROS for the duration of a ``with``: a transport that takes large images, no signal handlers.
 
     Args:
-        arguments: the command line, program name included.
+        arguments: what is for ROS of the command line.
 
     Raises:
         RosError: the ROS arguments cannot be parsed.
     """
     os.environ.setdefault(PROFILE_VARIABLE, str(config_dir() / 'fastdds_large_data.xml'))
     try:
-        rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=['', *arguments], signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # rclpy's errors have no narrower public base
         raise RosError(f'ROS arguments: {_first_sentence(error)}') from None
     try:
@@ -89,6 +93,4 @@ def ros(arguments: Sequence[str]) -> Iterator[None]:
 
 def _first_sentence(error: Exception) -> str:
     """rcl's message without its own preamble, and without the source lines it appends."""
-    return str(error).split(', at /')[0].removeprefix('failed to initialize rcl: ').removeprefix(
-        'Failed to parse ROS arguments: '
-    )
+    return str(error).split(', at /')[0].removeprefix('failed to initialize rcl: ')

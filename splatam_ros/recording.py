@@ -122,9 +122,10 @@ class Recording:
         first = next(self.messages([topic]), None)
         if first is None:
             return False
-        message = deserialize_message(first.data, self.topics[topic].message_class)
+        with self._read_errors():
+            message = deserialize_message(first.data, self.topics[topic].message_class)
         if self.topics[topic].type_name == 'sensor_msgs/msg/CompressedImage':
-            return 'compressedDepth' in message.format
+            return 'compressedDepth' in message.format or 'depth' in topic
         return message.encoding.lower() in DEPTH_ENCODINGS
 
     def close(self) -> None:

@@ -1,0 +1,179 @@
+"""A ROS graph for one test: processes under test on it, and a node of the test's own."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from splatam_core.resources import config_dir
+
+ROOT = Path(__file__).resolve().parents[2]
+TIMEOUT_S = 60.0  # only ever waited out when a test fails; two busy cores make everything slow
+DOMAINS = itertools.count(os.getpid())
+RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def environment(domain: int, log_folder: Path) -> dict[str, str]:
+    return {
+        **os.environ,
+        'ROS_DOMAIN_ID': str(domain),
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        'ROS_PYTHON_CHECK_FIELDS': '1',
+        'ROS_LOG_DIR': str(log_folder),
+        'PYTHONUNBUFFERED': '1',
+    }
+
+
+class Process:
+    """A process under test; what it says goes into a file."""
+
+    def __init__(
+        self, command: Sequence[str], environment: dict[str, str], log: Path, stdin: int = subprocess.DEVNULL
+    ) -> None:
+        self._log = log
+        with log.open('wb') as file:
+            self._process = subprocess.Popen(
+                command, cwd=ROOT, env=environment, stdin=stdin, stdout=file, stderr=subprocess.STDOUT
+            )
+
+    @property
+    def text(self) -> str:
+        return self._log.read_text(errors='replace')
+
+    @property
+    def lines(self) -> list[str]:
+        return self.text.splitlines()
+
+    @property
+    def is_running(self) -> bool:
+        return self._process.poll() is None
+
+    def send(self, number: signal.Signals) -> None:
+        self._process.send_signal(number)
+
+    def wait(self, timeout_s: float = TIMEOUT_S) -> int:
+        """Its exit code."""
+        try:
+            return self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f'still running after {timeout_s} s, and said:\n{self.text}') from None
+
+    def says(self, *parts: str) -> bool:
+        """Whether one line holds all of these."""
+        return any(all(part in line for part in parts) for line in self.lines)
+
+    def wait_says(self, *parts: str, timeout_s: float = TIMEOUT_S) -> None:
+        wait_until(lambda: self.says(*parts) or not self.is_running, timeout_s, lambda: self.text)
+        assert self.says(*parts), f'not said: {parts}; but:\n{self.text}'
+
+    def end(self) -> None:
+        if self.is_running:
+            self._process.kill()
+            self._process.wait()
+
+
+def wait_until(
+    condition: Callable[[], object], timeout_s: float = TIMEOUT_S, explain: Callable[[], str] = lambda: ''
+) -> None:
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline_s, f'not so within {timeout_s} s. {explain()}'
+        time.sleep(0.02)
+
+
+class Graph:
+    """A domain of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.domain = 1 + next(DOMAINS) % 101
+        self.folder = folder
+        self._processes: list[Process] = []
+        self._context: Context | None = None
+        os.environ.update(environment(self.domain, folder))
+        os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(config_dir() / 'fastdds_large_data.xml'))
+
+    # --- processes ---
+
+    def start(self, *command: str, stdin: int = subprocess.DEVNULL) -> Process:
+        variables = environment(self.domain, self.folder)
+        variables.pop('FASTRTPS_DEFAULT_PROFILES_FILE')  # they must find it themselves
+        process = Process(
+            [sys.executable, *command], variables, self.folder / f'process_{len(self._processes)}.log', stdin
+        )
+        self._processes.append(process)
+        return process
+
+    def play(self, *arguments: str, stdin: int = subprocess.DEVNULL) -> Process:
+        return self.start('-m', 'splatam_ros.bag_player', *arguments, stdin=stdin)
+
+    def run_node(self, *ros_arguments: str, **parameters: Any) -> Process:
+        return self.start('-m', 'splatam_ros.main', *node_arguments(*ros_arguments, **parameters))
+
+    # --- the test's own node ---
+
+    @property
+    def node(self) -> Node:
+        if self._context is None:
+            self._context = Context()
+            rclpy.init(context=self._context, domain_id=self.domain)
+            self._node = Node('test', context=self._context, use_global_arguments=False)
+            self._executor = SingleThreadedExecutor(context=self._context)
+            self._executor.add_node(self._node)
+        return self._node
+
+    def spin_until(
+        self, condition: Callable[[], object], timeout_s: float = TIMEOUT_S, explain: Callable[[], str] = lambda: ''
+    ) -> None:
+        assert self.node
+        deadline_s = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < deadline_s, f'not so within {timeout_s} s. {explain()}'
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def spin_for(self, seconds: float) -> None:
+        """For what must not happen: there is no event to wait for."""
+        deadline_s = time.monotonic() + seconds
+        while time.monotonic() < deadline_s:
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def collect(self, message_class: type, topic: str, qos: QoSProfile = RELIABLE, raw: bool = False) -> list[Any]:
+        """Subscribe; the list grows while the graph spins."""
+        messages: list[Any] = []
+        self.node.create_subscription(message_class, topic, messages.append, qos, raw=raw)
+        return messages
+
+    def publisher(self, message_class: type, topic: str, qos: QoSProfile = RELIABLE) -> Publisher:
+        return self.node.create_publisher(message_class, topic, qos)
+
+    def close(self) -> None:
+        for process in self._processes:
+            process.end()
+        if self._context is not None:
+            self._executor.shutdown()
+            self._node.destroy_node()
+            rclpy.try_shutdown(context=self._context)
+
+
+def node_arguments(*ros_arguments: str, **parameters: Any) -> list[str]:
+    """Arguments that set parameters; ``a__b`` stands for ``a.b``."""
+    settings = {name.replace('__', '.'): value for name, value in parameters.items()}
+    words = [word for name, value in settings.items() for word in ('-p', f'{name}:={_yaml(value)}')]
+    return ['--ros-args', *words, *ros_arguments]
+
+
+def _yaml(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)

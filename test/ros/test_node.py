@@ -1,0 +1,382 @@
+"""The node as a process of its own, over DDS."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shutil
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped
+from graph import Graph, Process, node_arguments
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from std_msgs.msg import Header
+
+from msg_adapters import camera_info, images, point_clouds, poses, stamps
+from msg_adapters.factory import RclpyMessages
+from splatam_core.config import load_config
+from splatam_core.datasets.synthetic import SyntheticSequence
+from splatam_core.ply import read_ply
+from splatam_core.run_folder import read_run
+from splatam_core.slam import Slam
+from splatam_core.types import RgbdFrame
+
+# These tests are about messages, not about maps: few steps, and nothing is lost that could be followed at all.
+QUICK = {
+    'tracking.iterations': 6, 'mapping.iterations': 3, 'mapping.every': 1, 'tracking.min_inlier_fraction': 0.1,
+    'threads': 1,
+}  # fmt: skip
+SLAM = {f'slam__{name.replace(".", "__")}': value for name, value in QUICK.items()}
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+MAKE = RclpyMessages()
+CAMERA_FRAME = 'camera_optical_frame'
+
+
+def run_node(graph: Graph, *ros_arguments: str, **parameters: Any) -> Process:
+    return graph.run_node(*ros_arguments, **{'preset': 'quick', **SLAM, **parameters})
+
+
+def trajectory_lines(folder: Path) -> list[str]:
+    path = folder / 'trajectory.txt'
+    return path.read_text().splitlines() if path.exists() else []
+
+
+def stamps_of(messages: list[Any]) -> list[int]:
+    return [stamps.message_stamp_ns(message) for message in messages]
+
+
+def offline(sequence: SyntheticSequence) -> tuple[Slam, list[np.ndarray]]:
+    slam = Slam(load_config('quick', QUICK))
+    return slam, [slam.process(frame).T_world_cam for frame in sequence]
+
+
+class Camera:
+    """A camera of the test's, sending what it is told to."""
+
+    def __init__(self, graph: Graph, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> None:
+        qos = QoSProfile(depth=100, reliability=reliability)
+        self._graph = graph
+        self._rgb, self._depth, self._info = (
+            graph.publisher(message_class, topic, qos)
+            for message_class, topic in ((Image, '/rgb/image'), (Image, '/depth/image'), (CameraInfo, '/rgb/camera_info'))
+        )  # fmt: skip
+
+    def wait_matched(self) -> None:
+        publishers = (self._rgb, self._depth, self._info)
+        self._graph.spin_until(lambda: all(publisher.get_subscription_count() for publisher in publishers))
+
+    def send(self, frame: RgbdFrame, *, depth_delay_ns: int = 0, **changes: Any) -> None:
+        """Send a frame's three messages; ``rgb__encoding='x'`` changes a field of one."""
+        c, stamp = frame.camera, frame.stamp_ns
+        parameters = camera_info.CameraParameters(c.width, c.height, c.fx, c.fy, c.cx, c.cy, frame_id=CAMERA_FRAME)
+        messages = {
+            'info': camera_info.info_message(MAKE, parameters, stamp),
+            'rgb': images.color_message(MAKE, frame.rgb, stamp, CAMERA_FRAME),
+            'depth': images.depth_message(MAKE, frame.depth_m, stamp + depth_delay_ns, CAMERA_FRAME),
+        }
+        for name, value in changes.items():
+            message, _, attribute = name.partition('__')
+            setattr(messages[message], attribute, value)
+        for message, publisher in ((messages['info'], self._info), (messages['rgb'], self._rgb), (messages['depth'], self._depth)):
+            publisher.publish(message)
+
+
+@pytest.fixture(scope='session')
+def frames(room: Callable[..., SyntheticSequence]) -> SyntheticSequence:
+    """The frames of ``bag``."""
+    return room(frames=12, noise=False)
+
+
+def still(frames: SyntheticSequence, number: int) -> RgbdFrame:
+    """A frame of a camera that does not move: nothing that could be lost."""
+    return replace(frames[0], stamp_ns=10**9 + number * 10**8)
+
+
+# --- the whole way ---
+
+
+def test_recording_in_poses_renders_cloud_and_folder_out(graph: Graph, bag: Path, frames: SyntheticSequence) -> None:
+    out = graph.folder / 'run'
+    node = run_node(
+        graph, save_path=out, queue_policy='all', exit_on_publisher_end=True,
+        publish_rate__path=0.0, publish_rate__cloud=0.0, max_cloud_points=500,
+    )  # fmt: skip
+    received = {
+        topic: graph.collect(message_class, f'/splatam/{topic}', qos)
+        for topic, message_class, qos in (
+            ('pose', PoseStamped, 100), ('odometry', Odometry, 100), ('path', PathMessage, LATCHED),
+            ('render/rgb', Image, 100), ('render/depth', Image, 100), ('render/silhouette', Image, 100),
+            ('map/points', PointCloud2, LATCHED), ('processed', Header, 100),
+        )
+    }  # fmt: skip
+    player = graph.play(str(bag), '--rate', 'max', '--wait-for')
+    graph.spin_until(lambda: not node.is_running, explain=lambda: player.text + node.text)
+    assert (player.wait(), node.wait()) == (0, 0), player.text + node.text
+    assert len(received) == 8 and 'WARN' not in node.text
+
+    expected_ns = [frame.stamp_ns for frame in frames]
+    assert stamps_of(received['pose']) == stamps_of(received['odometry']) == expected_ns
+    assert [stamps.to_ns(message.stamp) for message in received['processed']] == expected_ns
+    for topic in ('path', 'render/rgb', 'render/depth', 'render/silhouette', 'map/points'):
+        # Their subscriptions may be discovered after the first frames; what comes is of frames, in order.
+        assert set(stamps_of(received[topic])) <= set(expected_ns)
+        assert stamps_of(received[topic])[-1] == expected_ns[-1], topic
+
+    # The same frames offline, to the last bit.
+    slam, expected_poses = offline(frames)
+    for message, T_world_cam in zip(received['pose'], expected_poses, strict=True):
+        assert message == poses.pose_stamped(MAKE, T_world_cam, stamps.message_stamp_ns(message), 'map')
+    odometry = received['odometry'][-1]
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ('map', CAMERA_FRAME)
+    assert odometry.pose.pose == received['pose'][-1].pose
+    assert [stamps.message_stamp_ns(pose) for pose in received['path'][-1].poses] == expected_ns
+    check_map({topic: messages[-1] for topic, messages in received.items()}, slam, expected_poses[-1])
+    check_folder(out, expected_ns, expected_poses)
+
+
+def check_map(newest: dict[str, Any], slam: Slam, T_world_cam: np.ndarray) -> None:
+    view = slam.render(T_world_cam)
+    np.testing.assert_array_equal(images.decode_color(newest['render/rgb']), view.rgb)
+    np.testing.assert_array_equal(images.decode_depth(newest['render/depth']), view.depth_m)
+    silhouette = newest['render/silhouette']
+    shown = np.frombuffer(silhouette.data, np.uint8).reshape(silhouette.height, silhouette.width) / 255
+    assert silhouette.encoding == 'mono8'
+    np.testing.assert_allclose(shown, view.silhouette, atol=0.51 / 255)  # rounded to whole steps
+    assert {newest[topic].header.frame_id for topic in newest if topic.startswith('render')} == {CAMERA_FRAME}
+    points, rgb = point_clouds.read_cloud(newest['map/points'])
+    assert newest['map/points'].header.frame_id == 'map' and len(points) == len(rgb) == 500
+    assert set(map(tuple, points)) <= set(map(tuple, slam.snapshot().means))
+
+
+def check_folder(out: Path, expected_ns: list[int], expected_poses: list[np.ndarray]) -> None:
+    run = read_run(out)
+    assert run.description.program == 'splatam_node'
+    assert run.trajectory.stamps_ns.tolist() == expected_ns
+    # The file has nine decimals; a rotation's entries add up a few of their errors.
+    np.testing.assert_allclose(run.trajectory.T_world_cam, np.stack(expected_poses), atol=5e-9)
+    metrics = json.loads((out / 'metrics.json').read_text())
+    assert metrics['frames'] == metrics['tracked'] == len(expected_ns)
+    assert len(read_ply(out / 'map.ply').means) == metrics['num_gaussians'] > 500
+
+
+# --- ends of all kinds ---
+
+
+def start_playback(graph: Graph, bag: Path, **parameters: Any) -> tuple[Process, Process, Path]:
+    """Node and player, with a third of the recording done."""
+    out = graph.folder / 'run'
+    node = run_node(graph, save_path=out, queue_policy='all', **parameters)
+    player = graph.play(str(bag), '--rate', '1', '--wait-for')
+    graph.spin_until(lambda: len(trajectory_lines(out)) >= 4, explain=lambda: node.text + player.text)
+    return node, player, out
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_signals_in_mid_run_leave_a_whole_folder(graph: Graph, bag: Path, number: signal.Signals) -> None:
+    node, player, out = start_playback(graph, bag)
+    node.send(number)
+    node.send(signal.SIGINT)  # an impatient user; must not get in the way of saving
+    assert node.wait() == 0, node.text
+    assert node.says('saved', 'frames') and 'Traceback' not in node.text
+    run = read_run(out)
+    metrics = json.loads((out / 'metrics.json').read_text())
+    assert len(run.trajectory) == len(run.frames) == metrics['frames'] == metrics['tracked'] >= 4
+    assert len(read_ply(out / 'map.ply').means) == metrics['num_gaussians']
+    assert not list(out.glob('*.tmp*'))
+    assert player.wait() == 1, player.text  # it played for somebody who left
+    assert player.says('left in mid-playback')
+
+
+def test_a_killed_node_loses_nothing_and_the_player_says_which_frame_is_missing(graph: Graph, bag: Path) -> None:
+    answered = graph.collect(PoseStamped, '/splatam/pose')
+    node, player, out = start_playback(graph, bag)
+    node.send(signal.SIGKILL)
+    player.wait_says('no answer on /splatam/pose', 'still waiting', timeout_s=20)
+    assert player.wait(timeout_s=30) == 1  # after the ten seconds for which a process may be silent
+    written = read_run(out)
+    assert set(stamps_of(answered)) <= set(written.trajectory.stamps_ns.tolist())
+    lines = trajectory_lines(out)
+    assert len(lines) >= 4 and all(len(line.split()) == 8 for line in lines)
+    error = next(line for line in player.lines if 'error:' in line)
+    assert 'left in mid-playback' in error
+    assert f'(image {len(lines) + 1})' in error or f'(image {len(answered) + 1})' in error
+
+
+def test_a_stalled_node_goes_on_and_loses_nothing(graph: Graph, bag: Path, frames: SyntheticSequence) -> None:
+    node, player, out = start_playback(graph, bag, exit_on_publisher_end=True)
+    node.send(signal.SIGSTOP)
+    player.wait_says('no answer on /splatam/pose', 'still waiting', timeout_s=20)
+    node.send(signal.SIGCONT)
+    assert player.wait() == 0, player.text
+    assert node.wait() == 0, node.text
+    assert read_run(out).trajectory.stamps_ns.tolist() == [frame.stamp_ns for frame in frames]
+
+
+BREAKS = """
+import sys
+from splatam_core.slam import Slam
+works, count = Slam.process, 0
+def process(self, frame):
+    global count
+    count += 1
+    if count == 4:
+        raise ZeroDivisionError('something nobody thought of')
+    return works(self, frame)
+Slam.process = process
+from splatam_ros.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_when_slam_breaks_what_is_done_is_saved(graph: Graph, bag: Path) -> None:
+    out = graph.folder / 'run'
+    node = graph.start('-c', BREAKS, *node_arguments(preset='quick', save_path=out, **SLAM))
+    player = graph.play(str(bag), '--wait-for')
+    assert node.wait() == 1, node.text
+    assert node.says('ZeroDivisionError: something nobody thought of'), node.text
+    assert len(read_run(out).trajectory) == 3 and (out / 'map.ply').is_file() and (out / 'metrics.json').is_file()
+    assert player.wait() == 1
+    assert player.says('left in mid-playback', '(image 4)')
+
+
+def test_a_folder_that_vanishes_is_one_error_at_the_end(graph: Graph, frames: SyntheticSequence) -> None:
+    out = graph.folder / 'run'
+    camera, done = Camera(graph), graph.collect(Header, '/splatam/processed')
+    node = run_node(graph, save_path=out)
+    camera.wait_matched()
+    for count in (1, 2):
+        camera.send(frames[count - 1])
+        graph.spin_until(lambda: len(done) == count, explain=lambda: node.text)  # noqa: B023
+    shutil.rmtree(out)
+    node.send(signal.SIGTERM)
+    assert node.wait() == 1
+    assert node.says('saving failed', str(out)) and 'Traceback' not in node.text
+
+
+# --- bad input ---
+
+
+def test_bad_input_is_a_warning_each_and_the_node_goes_on(graph: Graph, frames: SyntheticSequence) -> None:
+    out = graph.folder / 'run'
+    camera = Camera(graph)
+    done = graph.collect(Header, '/splatam/processed')
+    tracked = graph.collect(PoseStamped, '/splatam/pose')
+    node = run_node(graph, save_path=out, queue_policy='all')
+    camera.wait_matched()
+    good = (still(frames, number) for number in itertools.count())
+
+    def send_good() -> None:
+        before = len(done)
+        camera.send(next(good))
+        graph.spin_until(lambda: len(done) > before, explain=lambda: node.text)
+
+    def send_bad(*expected: str, frame: RgbdFrame | None = None, **changes: Any) -> None:
+        camera.send(frame or next(good), **changes)
+        graph.spin_until(lambda: node.says('WARN', *expected), explain=lambda: f'{expected}: {node.text}')
+        send_good()
+
+    send_good()
+    send_bad('colour left out', "'nv99'", rgb__encoding='nv99')
+    send_bad('depth left out', "'rgb8'", depth__encoding='rgb8')
+    send_bad('CameraInfo left out', 'not calibrated', info__k=np.zeros(9))
+    wide = frames[0]
+    send_bad('frame left out', '64x48', '32x24', depth__height=24, depth__width=32, depth__step=128,
+             depth__data=images.depth_message(MAKE, wide.depth_m[:24, :32], 0, '').data)  # fmt: skip
+    last_ns = stamps.to_ns(done[-1].stamp)
+    nothing = replace(wide, stamp_ns=last_ns + 1000, depth_m=np.full_like(wide.depth_m, np.nan))
+    send_bad('lost', frame=nothing, depth__data=nan_depth(wide))
+    send_bad('dropped', 'stamp', frame=replace(wide, stamp_ns=stamps.to_ns(done[-1].stamp)))
+    send_bad('left out', 'not after the last one', frame=replace(wide, stamp_ns=10**6))
+
+    assert node.is_running
+    node.send(signal.SIGINT)
+    assert node.wait() == 0, node.text
+    run = read_run(out)
+    assert run.trajectory.stamps_ns.tolist() == stamps_of(tracked)
+    assert list(run.lost_ns) == [nothing.stamp_ns]
+    assert 'Traceback' not in node.text
+
+
+def nan_depth(frame: RgbdFrame) -> Any:
+    return images.depth_message(MAKE, frame.depth_m, 0, '').data.__class__(
+        'B', np.full_like(frame.depth_m, np.nan).tobytes()
+    )
+
+
+def test_a_camera_that_changes_is_refused_and_the_first_one_goes_on(graph: Graph, frames: SyntheticSequence) -> None:
+    camera, done = Camera(graph), graph.collect(Header, '/splatam/processed')
+    tracked = graph.collect(PoseStamped, '/splatam/pose')
+    node = run_node(graph)
+    camera.wait_matched()
+    first, second, third = (still(frames, number) for number in range(3))
+    other = replace(second, camera=replace(second.camera, fx=60.0))
+    for count, frame in enumerate((first, other, third), start=1):
+        camera.send(frame)
+        graph.spin_until(lambda: len(done) == count, explain=lambda: node.text)  # noqa: B023
+    assert node.says('WARN', 'the camera changed')
+    graph.spin_until(lambda: len(tracked) == 2)
+    assert stamps_of(tracked) == [first.stamp_ns, third.stamp_ns]
+
+
+def test_a_best_effort_camera_is_heard(graph: Graph, frames: SyntheticSequence) -> None:
+    node = run_node(graph, no_data_timeout=1.0)
+    node.wait_says('no publisher on /rgb/camera_info, /rgb/image and /depth/image')
+    camera = Camera(graph, ReliabilityPolicy.BEST_EFFORT)
+    tracked = graph.collect(PoseStamped, '/splatam/pose')
+    camera.wait_matched()
+    node.wait_says('/rgb/image is published best effort')
+
+    sent = iter(range(10**6))
+
+    def send() -> int:
+        """Best effort: the first messages may be lost, stamps must increase."""
+        camera.send(replace(frames[0], stamp_ns=10**9 + 10**7 * next(sent)))
+        return len(tracked)
+
+    graph.spin_until(send, explain=lambda: node.text)
+
+
+def test_frames_whose_stamps_differ_pair_and_the_last_does_not_wait_for_ever(
+    graph: Graph, frames: SyntheticSequence
+) -> None:
+    camera, tracked = Camera(graph), graph.collect(PoseStamped, '/splatam/pose')
+    node = run_node(graph, queue_policy='all')
+    camera.wait_matched()
+    for number in range(3):
+        camera.send(still(frames, number), depth_delay_ns=5_000_000)
+    graph.spin_until(lambda: len(tracked) == 3, explain=lambda: node.text)
+    assert stamps_of(tracked) == [still(frames, number).stamp_ns for number in range(3)]
+
+
+# --- parameters on the command line ---
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'message'),
+    [
+        ({'slam.tracking.iteratons': 3}, "did you mean 'tracking.iterations'"),
+        ({'queue_policy': 'newest'}, "queue_policy = 'newest': expected one of latest, all"),
+    ],
+)
+def test_unusable_parameters_are_one_line(graph: Graph, parameters: dict[str, Any], message: str) -> None:
+    node = graph.run_node(**parameters)
+    assert node.wait() == 2
+    errors = [line for line in node.lines if 'error:' in line]
+    assert len(errors) == 1 and message in errors[0] and 'Traceback' not in node.text
+
+
+def test_a_folder_that_is_in_use_is_refused(graph: Graph) -> None:
+    (graph.folder / 'run').mkdir()
+    (graph.folder / 'run' / 'thesis.tex').touch()
+    node = graph.run_node(save_path=graph.folder / 'run')
+    assert node.wait() == 2
+    assert node.says('error:', 'run', 'choose another folder')
