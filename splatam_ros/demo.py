@@ -20,7 +20,7 @@ from pathlib import Path
 from types import FrameType, TracebackType
 
 SCENE = 'synthetic'
-SCENE_FRAMES = 100
+SCENE_FRAMES = 150
 WIDTH = 320
 MARKER = '.demo'
 COMMANDS = {
@@ -77,10 +77,11 @@ class Processes:
         running = [process for process in reversed(self._started) if process.poll() is None]
         for process in running:
             process.send_signal(signal.SIGINT)
-        for process in running:
-            try:
+        try:
+            for process in running:
                 process.wait(STOP_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
+        except (subprocess.TimeoutExpired, KeyboardInterrupt):  # a second Ctrl-C does not wait any longer
+            for process in running:
                 process.kill()
                 process.wait()
 
@@ -105,15 +106,13 @@ def last_lines(log: Path) -> str:
     return '\n'.join(f'  {line}' for line in log.read_text(errors='replace').splitlines()[-LOG_LINES:])
 
 
-def remove_previous(folder: Path) -> None:
-    """Remove what an earlier demo left.
+def require_replaceable(folder: Path) -> None:
+    """Check that a folder is not there, or was made by an earlier demo.
 
     Raises:
-        DemoError: somebody else made the folder.
+        DemoError: somebody else made it.
     """
-    if (folder / MARKER).is_file():
-        shutil.rmtree(folder)
-    elif folder.exists():
+    if folder.exists() and not (folder / MARKER).is_file():
         raise DemoError(f'{folder} exists and was not made by the demo: move it away, or choose another --out')
 
 
@@ -165,14 +164,16 @@ def demo(source: str | None, out: Path) -> None:
     """
     work = out.with_name(f'{out.name}-input')
     bag = work / 'recording'
-    remove_previous(out)
-    remove_previous(work)
+    require_replaceable(out)
+    require_replaceable(work)
+    shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     (work / MARKER).touch()
     cut = ('--max-frames', str(SCENE_FRAMES)) if source is None else ()
     with Processes() as processes:
+        processes.run('splatam', 'convert', source or SCENE, str(bag), '--width', str(WIDTH), *cut)
+        shutil.rmtree(out, ignore_errors=True)
         try:
-            processes.run('splatam', 'convert', source or SCENE, str(bag), '--width', str(WIDTH), *cut)
             play(processes, bag, out, work / 'node.log')
             processes.run('splatam', 'evaluate', str(out), '--truth', str(bag))
         finally:
