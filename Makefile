@@ -65,8 +65,8 @@ colcon: $(VENV)/.created
 	rm -rf "$$package"/build "$$package"/*.egg-info
 	cd "$$scratch/workspace"
 	colcon build
-	colcon test --return-code-on-test-failure
-	colcon test-result --all
+	colcon test
+	colcon test-result --all --verbose
 
 # Everything but running it: the shipping flags, a cross compiler, and this machine's Python headers.
 ARM := aarch64-linux-gnu
