@@ -122,7 +122,7 @@ class TrackingConfig:
     min_inlier_fraction: float = _setting(
         0.5, 'Lost when a smaller share of those pixels agrees with the map in depth and colour.', '', 0.0, 1.0
     )
-    inlier_depth: float = _setting(0.05, 'Agreeing depth differs by at most this share of the reading.', '', 0.0)
+    inlier_depth: float = _setting(0.1, 'Agreeing depth differs by at most this share of the reading.', '', 0.0)
     inlier_color: float = _setting(0.2, 'Agreeing colour differs by at most this, mean over channels in [0, 1].', '', 0.0)
 
 
