@@ -23,7 +23,7 @@ help:
 	echo 'make check-aarch64   compile the kernels for the processors of robots'
 	echo 'make clean           remove what was built; $(VENV) and out stay'
 
-setup: $(VENV)/.installed
+setup: $(VENV)/.native $(VENV)/.installed
 
 $(VENV)/.created:
 	@if [[ -z '$(PYTHON)' ]]; then echo 'splatam_ros needs Python 3.10, 3.11 or 3.12: apt install python3 python3-venv, or PYTHON=path' >&2; exit 1; fi
@@ -38,7 +38,7 @@ $(VENV)/.native: $(CSRC) setup.py package.xml constraints.txt | $(VENV)/.created
 	$(BIN)/python setup.py --quiet build_ext --inplace --force
 	touch $@
 
-$(VENV)/.installed: setup.py package.xml pyproject.toml constraints.txt $(VENV)/.native
+$(VENV)/.installed: setup.py package.xml pyproject.toml constraints.txt | $(VENV)/.native
 	@echo 'installing what splatam_ros needs into $(VENV): some minutes the first time'
 	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[ros,test]'
 	touch $@
