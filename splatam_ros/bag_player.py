@@ -31,7 +31,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add('bag', type=Path, metavar='BAG', help='a rosbag2: folder, .db3 or .mcap')
-    add('--rate', type=_rate, default=1.0, metavar='R', help="speed; 0 or 'max' = as fast as listeners allow (default: 1)")
+    add('--rate', type=_rate, default=1.0, metavar='R', help="speed; 'max' or 0 = as fast as listeners allow")
     add('--start-offset', type=_seconds, default=0.0, metavar='S', help='skip the first seconds')
     add('--duration', type=_seconds, metavar='S', help='play that many seconds')
     add('--loop', action='store_true', help='start over at the end, stamps included, until stopped')
@@ -46,11 +46,11 @@ def make_parser() -> argparse.ArgumentParser:
         f'(default: {ANSWERS[0]}, with {ANSWERS[1]} for frames that have no pose)',
     )  # fmt: skip
     add('--max-ahead', type=_count, default=2, metavar='N', help='that N (default: %(default)s)')
-    add('--wait-timeout', type=_positive, default=60.0, metavar='S', help='give up on an answer (default: %(default)g s)')
+    add('--wait-timeout', type=_positive, default=60.0, metavar='S', help='give up on an answer (default: 60 s)')
     add('--no-wait-for-subscribers', action='store_true', help='do not wait until somebody subscribes to the images')
     add(
         '--discovery-timeout', type=_positive, default=30.0, metavar='S',
-        help='give up on subscribers and on TOPIC (default: %(default)g s)',
+        help='give up on subscribers and on TOPIC (default: 30 s)',
     )  # fmt: skip
     return parser
 
@@ -67,7 +67,8 @@ def make_options(args: argparse.Namespace, recording: Recording) -> Options:
         if name not in known:
             raise RosError(f'{name} is not in {recording.path}, which holds {", ".join(sorted(known))}')
     excluded = {*args.exclude, *(['/clock'] if args.clock else [])}
-    topics = tuple(name for name in (args.topics or recording.topics) if name in recording.topics and name not in excluded)
+    playable = [name for name in recording.topics if name not in excluded]
+    topics = tuple(name for name in playable if not args.topics or name in args.topics)
     if not topics:
         raise RosError(f'{recording.path}: no topic is left to play')
     seconds = (recording.end_ns - recording.start_ns) / 1e9

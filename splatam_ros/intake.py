@@ -13,7 +13,7 @@ from splatam_core.camera import CameraCalibration, FrameFactory
 from splatam_core.errors import CameraError, FrameError
 from splatam_core.types import RgbdFrame
 from splatam_ros.parameters import NodeOptions
-from splatam_ros.warnings import ThrottledWarnings
+from splatam_ros.throttled_warnings import ThrottledWarnings
 
 T = TypeVar('T')
 
@@ -65,13 +65,13 @@ class Intake:
         self._reported = now
         self._report('duplicates', now.duplicates - before.duplicates, 'with a stamp that was there already')
         self._report('late', now.late - before.late, 'older than the last frame; do the stamps increase?')
-        self._report('unpaired colour', now.unpaired_color - before.unpaired_color, f'(colour) without depth{_gap(now)}')
-        self._report('unpaired depth', now.unpaired_depth - before.unpaired_depth, f'(depth) without colour{_gap(now)}')
+        self._report('color', now.unpaired_color - before.unpaired_color, f'(colour) without depth{_gap(now)}')
+        self._report('depth', now.unpaired_depth - before.unpaired_depth, f'(depth) without colour{_gap(now)}')
         self._report('without info', now.without_info - before.without_info, 'with depth, but no CameraInfo has come')
 
     def _report(self, kind: str, count: int, what: str) -> None:
         if count > 0:
-            self._warnings.warn(kind, f'{count} image{"s" if count > 1 else ""} dropped: {what}')
+            self._warnings.warn(f'dropped {kind}', f'{count} image{"s" if count > 1 else ""} dropped: {what}')
 
     def _frames(self, sets: list[RgbdSet]) -> list[RgbdFrame]:
         frames = [self._frame(found) for found in sets]

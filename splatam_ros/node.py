@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable
-from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -23,10 +22,10 @@ from splatam_ros.diagnosis import why_no_frames
 from splatam_ros.inputs import Input
 from splatam_ros.intake import Intake
 from splatam_ros.outputs import Outputs
-from splatam_ros.warnings import ThrottledWarnings
+from splatam_ros.throttled_warnings import ThrottledWarnings
 
 TICK_S = 0.2
-QUIET_S = 1.0  # without a message: what can be paired by then is paired, and publishers that left are gone
+QUIET_S = 1.0  # without an image: what can be paired by then is paired, and publishers that left are gone
 LONG_QUIET_S = 10.0  # the same where one more partner is due; a paused player may be about to send it
 PROGRESS_S = 10.0
 TRANSPORTS = {
@@ -87,26 +86,30 @@ class SplatamNode(Node):
         rgb_suffix, rgb_class = TRANSPORTS[self.options.rgb_transport]
         depth_suffix, depth_class = TRANSPORTS[self.options.depth_transport]
         streams = (  # of messages that arrive together the executor takes the camera's first
-            (CameraInfo, 'rgb/camera_info', self._intake.info),
-            (rgb_class, f'rgb/image{rgb_suffix}', self._intake.color),
-            (depth_class, f'depth/image{depth_suffix}', self._intake.depth),
+            (CameraInfo, 'rgb/camera_info', self._on_info),
+            (rgb_class, f'rgb/image{rgb_suffix}', self._on_color),
+            (depth_class, f'depth/image{depth_suffix}', self._on_depth),
         )
         return [
             Input(
-                self, message_class, topic, self._handler(add),
+                self, message_class, topic, on_message,
                 reliability=self.options.input_reliability, keep_all=self._keeps_all,
             )
-            for message_class, topic, add in streams
+            for message_class, topic, on_message in streams
         ]  # fmt: skip
 
     # --- executor thread ---
 
-    def _handler(self, add: Callable[[Any], list[RgbdFrame]]) -> Callable[[Any], None]:
-        def handle(message: Any) -> None:
-            self._supply(add(message))
-            self._heard_s = time.monotonic()
+    def _on_info(self, message: CameraInfo) -> None:
+        self._supply(self._intake.info(message))
 
-        return handle
+    def _on_color(self, message: Image | CompressedImage) -> None:
+        self._supply(self._intake.color(message))
+        self._heard_s = time.monotonic()  # after supplying, which may have waited for SLAM
+
+    def _on_depth(self, message: Image | CompressedImage) -> None:
+        self._supply(self._intake.depth(message))
+        self._heard_s = time.monotonic()
 
     def _supply(self, frames: list[RgbdFrame]) -> None:
         for frame in frames:
@@ -153,9 +156,11 @@ class SplatamNode(Node):
             self.get_logger().warning(f'no frame for {timeout_s:g} s: {why}')
 
     def _check_end(self, quiet_s: float) -> None:
-        """Finish when a worker broke down, or the publishers have left and all of theirs is processed."""
-        has_publishers = any(item.num_publishers for item in self._inputs[1:])
-        self._had_publishers |= has_publishers
+        """Finish when the worker broke down, or the image publishers have left and all of theirs is processed."""
+        images = self._inputs[1:]
+        has_publishers = any(item.num_publishers for item in images)
+        # Publishers may have come and gone while the executor waited for SLAM; their images were received then.
+        self._had_publishers |= has_publishers or any(item.received for item in images)
         if self._worker.error is not None:
             self.is_finished = True
         elif self.options.exit_on_publisher_end and self._had_publishers and not has_publishers and quiet_s > QUIET_S:

@@ -183,8 +183,9 @@ class Outputs:
             self._path.append(result.stamp_ns, result.T_world_cam)
             moment = Moment(result.stamp_ns, result.T_world_cam, camera_frame, slam, self._path.poses, self._options,
                             self._factory)  # fmt: skip
+            now_s = time.monotonic()  # one for all: renders of one rate are of one frame
             for output, publisher in self._publishers:
-                if self._is_due(output, publisher):
+                if self._is_due(output, publisher, now_s):
                     publisher.publish(output.message(moment))
         self.done(result.stamp_ns)
 
@@ -196,10 +197,10 @@ class Outputs:
     def _create(self, type_name: str, topic: str, qos: QoSProfile) -> Publisher:
         return self._node.create_publisher(message_class(type_name), f'~/{topic}', qos)
 
-    def _is_due(self, output: Output, publisher: Publisher) -> bool:
+    def _is_due(self, output: Output, publisher: Publisher, now_s: float) -> bool:
         if output.trigger is Trigger.POSE:
             return True
-        now_s, rate_hz = time.monotonic(), output.rate(self._options)
+        rate_hz = output.rate(self._options)
         if publisher.get_subscription_count() == 0 or now_s < self._due_s.get(output.topic, 0.0):
             return False
         self._due_s[output.topic] = now_s + (1 / rate_hz if rate_hz else 0.0)

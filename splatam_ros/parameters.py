@@ -32,7 +32,7 @@ def _setting(
 
 NODE_SETTINGS: tuple[Setting, ...] = (
     _setting('preset', 'splatam', 'SLAM preset: the name of a shipped one, or a .yaml file.'),
-    _setting('save_path', '', 'Folder for trajectory, map and metrics; must be new or empty. Empty = nothing is saved.'),
+    _setting('save_path', '', 'New or empty folder for trajectory, map and metrics; none = nothing is saved.'),
     _setting('overwrite', False, 'Replace the run that is in save_path, if nothing else is there.'),
     _setting('save_on_shutdown', True, 'Save map and metrics at the end; the trajectory is written as it goes anyway.'),
     _setting('width', 0, 'Resize frames to this width; 0 = as they come.', 'px', 0, 16384),
@@ -51,7 +51,7 @@ NODE_SETTINGS: tuple[Setting, ...] = (
              choices=('latest', 'all')),
     _setting('queue_size', 2, 'Frames that wait for SLAM.', '', 1, 1000),
     _setting('max_cloud_points', 200_000, 'Points of a published cloud at most.', '', 1, 50_000_000),
-    _setting('max_path_poses', 2000, 'Poses of a published path at most; older ones are thinned out.', '', 2, 1_000_000),
+    _setting('max_path_poses', 2000, 'Poses of a published path at most; evenly thinned out.', '', 2, 1_000_000),
     _setting('publish_rate.path', 1.0, 'Paths a second at most; 0 = one a frame.', 'Hz', 0.0, 1000.0),
     _setting('publish_rate.render', 0.0, 'Renders a second at most; 0 = one a frame.', 'Hz', 0.0, 1000.0),
     _setting('publish_rate.cloud', 1.0, 'Clouds a second at most; 0 = one a frame.', 'Hz', 0.0, 1000.0),

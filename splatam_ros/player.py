@@ -96,8 +96,8 @@ class Player:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self._publishers = {name: self._create_publisher(recording.topics[name]) for name in options.topics}
-        awaited = [name for name in options.topics if self._is_awaited(recording.topics[name])]
-        self._listeners = Listeners(node, {self._publishers[name].topic_name: self._publishers[name] for name in awaited})
+        awaited = [self._publishers[name] for name in options.topics if _is_awaited(recording.topics[name])]
+        self._listeners = Listeners(node, {publisher.topic_name: publisher for publisher in awaited})
         self._answers = [Answers(node, topic, self._answered) for topic in options.wait_for]
         self._clock_publisher = node.create_publisher(Clock, '/clock', 10) if options.clock_hz else None
         self._start_ns = recording.start_ns + round(options.start_offset_s * 1e9)
@@ -152,10 +152,6 @@ class Player:
         durability = DurabilityPolicy.TRANSIENT_LOCAL if topic.is_latched else DurabilityPolicy.VOLATILE
         qos = QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
         return self._node.create_publisher(topic.message_class, self._options.remap.get(topic.name, topic.name), qos)
-
-    @staticmethod
-    def _is_awaited(topic: RecordedTopic) -> bool:
-        return topic.is_image or topic.type_name == CAMERA_INFO
 
     # --- before the first message ---
 
@@ -348,6 +344,11 @@ class Player:
 
     def _say(self, text: str) -> None:
         tqdm.write(f'splatam_bag_player: {text}')
+
+
+def _is_awaited(topic: RecordedTopic) -> bool:
+    """Whether playback waits for somebody to subscribe to it."""
+    return topic.is_image or topic.type_name == CAMERA_INFO
 
 
 def _is_acknowledged(publisher: Publisher) -> bool:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import fcntl
 import itertools
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import rclpy
 from rclpy.context import Context
@@ -23,7 +25,8 @@ from splatam_core.resources import config_dir
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT_S = 60.0  # only ever waited out when a test fails; two busy cores make everything slow
-DOMAINS = itertools.count(os.getpid())
+NUM_DOMAINS = 101  # above, the ports may belong to somebody else
+CANDIDATES = itertools.count(os.getpid())
 RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 
 
@@ -36,6 +39,22 @@ def environment(domain: int, log_folder: Path) -> dict[str, str]:
         'ROS_LOG_DIR': str(log_folder),
         'PYTHONUNBUFFERED': '1',
     }
+
+
+def reserve_domain() -> tuple[int, IO[bytes]]:
+    """A domain that no other test run on this machine uses, for as long as the file stays open."""
+    folder = Path(tempfile.gettempdir()) / 'splatam_ros_test_domains'
+    folder.mkdir(exist_ok=True)
+    for candidate in itertools.islice(CANDIDATES, NUM_DOMAINS):
+        domain = 1 + candidate % NUM_DOMAINS
+        file = (folder / str(domain)).open('wb')
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.close()
+        else:
+            return domain, file
+    raise AssertionError('all ROS domains are in use by tests')
 
 
 class Process:
@@ -99,7 +118,7 @@ class Graph:
     """A domain of its own."""
 
     def __init__(self, folder: Path) -> None:
-        self.domain = 1 + next(DOMAINS) % 101
+        self.domain, self._reservation = reserve_domain()
         self.folder = folder
         self._processes: list[Process] = []
         self._context: Context | None = None
@@ -166,6 +185,7 @@ class Graph:
             self._executor.shutdown()
             self._node.destroy_node()
             rclpy.try_shutdown(context=self._context)
+        self._reservation.close()
 
 
 def node_arguments(*ros_arguments: str, **parameters: Any) -> list[str]:

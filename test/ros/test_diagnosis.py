@@ -14,7 +14,7 @@ from splatam_ros.diagnosis import why_no_frames
 from splatam_ros.inputs import Input
 from splatam_ros.intake import Intake
 from splatam_ros.parameters import NODE_SETTINGS, NodeOptions
-from splatam_ros.warnings import ThrottledWarnings
+from splatam_ros.throttled_warnings import ThrottledWarnings
 
 
 class Receiver:

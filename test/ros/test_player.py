@@ -26,6 +26,7 @@ from std_msgs.msg import String
 
 RGB, DEPTH, INFO = '/rgb/image', '/depth/image', '/rgb/camera_info'
 STREAMS = ((Image, RGB), (Image, DEPTH), (CameraInfo, INFO))
+UNHEARD = 'nowhere_msgs/msg/Unheard'
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -142,17 +143,17 @@ def test_loop_starts_over_until_stopped(graph: Graph, bag: Path) -> None:
 def make_mixed_bag(path: Path) -> None:
     """A latched text at the start, a type nobody has installed, and IMU messages; no image."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    store.register(get_types_from_msg('int32 value', 'nowhere_msgs/msg/Unheard'))
+    store.register(get_types_from_msg('int32 value', UNHEARD))
     zero = QosTime(0, 0)
     latched = Qos(QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, zero, zero,
                   QosLiveliness.AUTOMATIC, zero, False)  # fmt: skip
     with Writer(path, version=9) as writer:
         text = writer.add_connection('/note', 'std_msgs/msg/String', typestore=store, offered_qos_profiles=[latched])
-        unheard = writer.add_connection('/unheard', 'nowhere_msgs/msg/Unheard', typestore=store)
+        unheard = writer.add_connection('/unheard', UNHEARD, typestore=store)
         imu = writer.add_connection('/imu', 'sensor_msgs/msg/Imu', typestore=store)
         writer.write(text, 10**9, serialize_message(String(data='true from the start')))
         for i in range(20):
-            writer.write(unheard, 10**9 + i, store.serialize_cdr(store.types['nowhere_msgs/msg/Unheard'](i), 'nowhere_msgs/msg/Unheard'))
+            writer.write(unheard, 10**9 + i, store.serialize_cdr(store.types[UNHEARD](i), UNHEARD))
             writer.write(imu, 10**9 + i * 50_000_000, serialize_message(Imu()))
 
 
@@ -165,7 +166,7 @@ def test_latched_messages_precede_the_start_and_unknown_types_are_left_out(graph
     assert notes[0].data == 'true from the start'
     player.send(signal.SIGTERM)
     assert player.wait() == 128 + signal.SIGTERM
-    warnings = [line for line in player.lines if 'nowhere_msgs/msg/Unheard' in line]
+    warnings = [line for line in player.lines if UNHEARD in line]
     assert len(warnings) == 1 and '/unheard is left out' in warnings[0]
 
 
@@ -195,7 +196,8 @@ def test_a_frame_that_nobody_answers_is_named(graph: Graph, bag: Path) -> None:
     graph.spin_until(lambda: not player.is_running)
     assert player.wait() == 1
     # Two were answered, so four more than that were handed out.
-    assert player.says('no answer on /splatam/pose for 1 s', '6 colour images', 'first frame not answered: 1.066666666 (image 3)')
+    missing = 'first frame not answered: 1.066666666 (image 3)'
+    assert player.says('no answer on /splatam/pose for 1 s', '6 colour images', missing)
 
 
 def test_any_topic_with_a_header_can_answer(graph: Graph, bag: Path) -> None:
@@ -358,7 +360,10 @@ def test_unusable_recordings_are_one_line(
         (['BAG', '--rate', '-1'], 'expected 0 or more'),
         (['BAG', '--remap', '/a'], 'expected /recorded:=/published'),
         (['BAG', '--discovery-timeout', '0.5'], 'nobody subscribes to /depth/image or /rgb/image'),
-        (['BAG', '--no-wait-for-subscribers', '--wait-for', '--discovery-timeout', '0.5'], 'nobody publishes /splatam/pose'),
+        (
+            ['BAG', '--no-wait-for-subscribers', '--wait-for', '--discovery-timeout', '0.5'],
+            'nobody publishes /splatam/pose',
+        ),
         (['BAG', '--topics', '/ground_truth/pose', '--rate', 'max'], 'count colour images'),
         (['BAG', '--ros-args', '-r', 'nonsense'], 'ROS arguments'),
     ],
