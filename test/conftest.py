@@ -8,14 +8,16 @@ from pathlib import Path
 
 import pytest
 
+from splatam_core.config import SlamConfig, apply_threads
 from splatam_core.datasets.synthetic import SyntheticSequence
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Rclpy checks the fields of messages in tests; it is too slow to do so otherwise."""
+    """Rclpy checks the fields of messages in tests; it is too slow to do so otherwise. Threads as in our processes."""
     os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
+    apply_threads(SlamConfig())
 
 
 @pytest.fixture(scope='session')

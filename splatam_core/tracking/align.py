@@ -45,11 +45,11 @@ class AlignmentTracker:
     def track(self, view: View, gaussians: Gaussians, T_cam_world: Matrix) -> TrackingResult:
         """See ``Tracker.track``."""
         frame = _Picture.of(view.camera, view.rgb.numpy(), np.where(view.valid, view.depth, np.float32(np.nan)))
-        frames = list(_halvings(frame))
+        frames = _levels(frame)
         best = self._render(view, gaussians, T_cam_world, None)
         for _ in range(self._config.renders):
             reference = _reference(view.camera, best.render, self._config.silhouette_threshold)
-            motion = _align(list(_halvings(reference)), frames, self._config.iterations)
+            motion = _align(_levels(reference), frames, self._config.iterations)
             aligned = self._render(view, gaussians, motion @ best.T_cam_world, best)
             if not aligned.cost < best.cost:
                 break
@@ -88,8 +88,15 @@ def _reference(camera: PinholeCamera, render: Render, silhouette_threshold: floa
     return _Picture.of(camera, render.rgb.numpy(), np.where(sure, render.depth().numpy(), np.float32(np.nan)))
 
 
+def _levels(picture: _Picture) -> list[_Picture]:
+    """The picture at a half, a quarter, ...; itself where it is too small for that.
+
+    The full resolution would cost three quarters of the work and gain nothing.
+    """
+    return list(_halvings(picture)) or [picture]
+
+
 def _halvings(picture: _Picture) -> Iterator[_Picture]:
-    """The picture at a half, a quarter, ... The full resolution costs three quarters of the work and gains nothing."""
     while min(picture.camera.width, picture.camera.height) >= 2 * _COARSEST_PX:
         height, width = picture.camera.height // 2, picture.camera.width // 2
         camera = picture.camera.cropped(2 * width, 2 * height).resized(width, height)
