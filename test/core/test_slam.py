@@ -151,7 +151,9 @@ def test_reference_and_cpu_rasterizers_run_the_same_slam() -> None:
     sequence = open_sequence('synthetic', width=32, max_frames=2)
     poses = []
     for backend in ('cpu', 'reference'):
-        slam = _slam(f'rasterizer={backend}', 'tracking.iterations=5', 'mapping.iterations=3')
+        slam = _slam(
+            f'rasterizer={backend}', 'tracking.method=render_and_compare', 'tracking.iterations=5', 'mapping.iterations=3'
+        )
         poses.append([slam.process(sequence[i]).T_world_cam for i in range(2)][1])
     np.testing.assert_allclose(poses[0], poses[1], atol=1e-4)
 
