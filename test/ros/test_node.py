@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 import shutil
 import signal
 from collections.abc import Callable
@@ -53,6 +54,12 @@ def trajectory_lines(folder: Path) -> list[str]:
 
 def stamps_of(messages: list[Any]) -> list[int]:
     return [stamps.message_stamp_ns(message) for message in messages]
+
+
+def newest_stamp(messages: list[Any]) -> int | None:
+    """Of messages with a header, or that are headers."""
+    header = getattr(messages[-1], 'header', messages[-1]) if messages else None
+    return None if header is None else stamps.to_ns(header.stamp)
 
 
 def offline(sequence: SyntheticSequence) -> tuple[Slam, list[np.ndarray]]:
@@ -124,17 +131,16 @@ def test_recording_in_poses_renders_cloud_and_folder_out(graph: Graph, bag: Path
     graph.spin_until(lambda: all(graph.node.count_publishers(topic) for topic in topics), explain=lambda: node.text)
     player = graph.play(str(bag), '--rate', 'max', '--wait-for')
     graph.spin_until(lambda: not node.is_running, explain=lambda: player.text + node.text)
-    graph.spin_for(0.3)  # everything has arrived by now; this takes it
     assert (player.wait(), node.wait()) == (0, 0), player.text + node.text
     assert 'WARN' not in node.text
 
     expected_ns = [frame.stamp_ns for frame in frames]
+    graph.spin_until(lambda: all(newest_stamp(messages) == expected_ns[-1] for messages in received.values()))
     assert stamps_of(received['pose']) == stamps_of(received['odometry']) == expected_ns
     assert [stamps.to_ns(message.stamp) for message in received['processed']] == expected_ns
     for topic in ('path', 'render/rgb', 'render/depth', 'render/silhouette', 'map/points'):
         # Their subscriptions may be discovered after the first frames; what comes is of frames, in order.
         assert set(stamps_of(received[topic])) <= set(expected_ns)
-        assert stamps_of(received[topic])[-1] == expected_ns[-1], topic
 
     # The same frames offline, to the last bit.
     slam, expected_poses = offline(frames)
@@ -194,7 +200,8 @@ def test_compressed_recordings(graph: Graph, frames: SyntheticSequence) -> None:
     player = graph.play(str(graph.folder / 'compressed'), '--rate', 'max', '--wait-for')
     assert (player.wait(), node.wait()) == (0, 0), player.text + node.text
     run = read_run(out)
-    assert run.trajectory.stamps_ns.tolist() == [frame.stamp_ns for frame in frames]
+    # Lost or not is no matter here; 32 pixels are few to find one's way by.
+    assert sorted([*run.trajectory.stamps_ns, *run.lost_ns]) == [frame.stamp_ns for frame in frames]
     assert (run.camera.width, run.camera.height) == (32, 24)
 
 
@@ -227,18 +234,18 @@ def test_signals_in_mid_run_leave_a_whole_folder(graph: Graph, bag: Path, number
 
 
 def test_a_killed_node_loses_nothing_and_the_player_says_which_frame_is_missing(graph: Graph, bag: Path) -> None:
-    answered = graph.collect(PoseStamped, '/splatam/pose')
     node, player, out = start_playback(graph, bag)
     node.send(signal.SIGKILL)
     player.wait_says('no answer on /splatam/pose', 'still waiting', timeout_s=20)
     assert player.wait(timeout_s=30) == 1  # after the ten seconds for which a process may be silent
-    written = read_run(out)
-    assert set(stamps_of(answered)) <= set(written.trajectory.stamps_ns.tolist())
     lines = trajectory_lines(out)
-    assert len(lines) >= 4 and all(len(line.split()) == 8 for line in lines)
+    assert len(read_run(out).trajectory) == len(lines) >= 4
     error = next(line for line in player.lines if 'error:' in line)
     assert 'left in mid-playback' in error
-    assert f'(image {len(lines) + 1})' in error or f'(image {len(answered) + 1})' in error
+    missing = re.search(r'first frame not answered: (\S+) \(image (\d+)\)', error)
+    # What was answered had been written; one more may have been when the kill came between the two.
+    assert len(lines) in (int(missing[2]) - 1, int(missing[2]))
+    assert missing[1] not in [line.split()[0] for line in lines[: int(missing[2]) - 1]]
 
 
 def test_a_stalled_node_goes_on_and_loses_nothing(graph: Graph, bag: Path, frames: SyntheticSequence) -> None:
@@ -305,9 +312,10 @@ def test_bad_input_is_a_warning_each_and_the_node_goes_on(graph: Graph, frames: 
     good = (still(frames, number) for number in itertools.count())
 
     def send_good() -> None:
-        before = len(done)
-        camera.send(next(good))
-        graph.spin_until(lambda: len(done) > before, explain=lambda: node.text)
+        frame = next(good)
+        camera.send(frame)
+        # The frame before may have been good enough: with a camera info that makes no sense the last one counts.
+        graph.spin_until(lambda: done and stamps.to_ns(done[-1].stamp) == frame.stamp_ns, explain=lambda: node.text)
 
     def send_bad(*expected: str, frame: RgbdFrame | None = None, **changes: Any) -> None:
         camera.send(frame or next(good), **changes)
@@ -331,6 +339,7 @@ def test_bad_input_is_a_warning_each_and_the_node_goes_on(graph: Graph, frames: 
     node.send(signal.SIGINT)
     assert node.wait() == 0, node.text
     run = read_run(out)
+    graph.spin_until(lambda: len(tracked) == len(run.trajectory))
     assert run.trajectory.stamps_ns.tolist() == stamps_of(tracked)
     assert list(run.lost_ns) == [nothing.stamp_ns]
     assert 'Traceback' not in node.text
