@@ -124,8 +124,8 @@ setup(
     entry_points={
         'console_scripts': [
             'splatam = splatam_core.cli:main',
-            'splatam_node = splatam_ros.main:main',
-            'splatam_bag_player = splatam_ros.bag_player:main',
+            'splatam_node = splatam_ros.entry:node',
+            'splatam_bag_player = splatam_ros.entry:player',
         ],
     },
     zip_safe=False,

@@ -310,7 +310,7 @@ def _progress(what: str) -> Callable[[range], Iterable[int]]:
     """Wraps a loop over frames in a progress bar that goes away when it is done."""
     from tqdm import tqdm
 
-    return lambda indices: tqdm(indices, unit='frame', desc=what, dynamic_ncols=True, leave=False)
+    return lambda indices: tqdm(indices, unit='frame', desc=what, dynamic_ncols=True, leave=False, disable=None)
 
 
 def _say(text: str) -> None:

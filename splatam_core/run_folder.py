@@ -295,7 +295,7 @@ def read_run(path: Path) -> RunRecord:
 
 
 def _overwrite_hint(path: Path) -> str:
-    return ', or pass --overwrite to replace the run in it' if (path / RUN).is_file() else ''
+    return ', or replace the run in it with --overwrite (the node: overwrite:=true)' if (path / RUN).is_file() else ''
 
 
 def _remove_run(path: Path) -> None:

@@ -110,3 +110,12 @@ def test_a_missing_compiler_is_one_line(tmp_path: Path) -> None:
     assert built.stderr.splitlines() == [
         "splatam_ros: no C++ compiler (looked for 'no-such-compiler'): apt install g++ python3-dev, or set CXX"
     ]
+
+
+@pytest.mark.parametrize('program', ['node', 'player'])
+def test_without_ros_one_line_says_what_to_install(program: str) -> None:
+    """In a Python that finds no rclpy: the import system is told that there is none."""
+    code = f"import sys; sys.modules['rclpy'] = None; from splatam_ros import entry; sys.exit(entry.{program}())"
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1 and 'pip install' in done.stderr

@@ -132,7 +132,7 @@ def test_existing_results_stay_unless_told_otherwise(copy: Path, capsys: pytest.
     before = (copy / 'trajectory.txt').read_bytes()
     again = ['run', SOURCE, '--width', WIDTH, '--max-frames', 1, *SETTINGS, '--no-evaluate', '--out', copy]
     assert splatam(*again) == 2
-    assert 'choose another folder, or pass --overwrite' in capsys.readouterr().err
+    assert 'choose another folder, or replace the run in it with --overwrite' in capsys.readouterr().err
     assert (copy / 'trajectory.txt').read_bytes() == before
     assert splatam(*again, '--overwrite') == 0
     assert len((copy / 'trajectory.txt').read_text().splitlines()) == 1

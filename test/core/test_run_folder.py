@@ -150,7 +150,7 @@ def test_damaged_metrics_are_one_line(tmp_path: Path) -> None:
 def test_existing_results_stay(tmp_path: Path) -> None:
     RunFolder.create(tmp_path, CONFIG, NODE).close()
     before = tree(tmp_path)
-    with pytest.raises(RunFolderError, match='exists: choose another folder, or pass --overwrite'):
+    with pytest.raises(RunFolderError, match='exists: choose another folder, or replace the run in it with --overwrite'):
         RunFolder.create(tmp_path, CONFIG, OFFLINE)
     assert tree(tmp_path) == before
 

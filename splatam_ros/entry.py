@@ -1,0 +1,33 @@
+"""The executables: nothing here needs ROS, so that its absence can be said in one line."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+_EXIT_USAGE = 2
+
+
+def node() -> int:
+    """``splatam_node``."""
+    return _main('splatam_ros.main')
+
+
+def player() -> int:
+    """``splatam_bag_player``."""
+    return _main('splatam_ros.bag_player')
+
+
+def _main(module: str) -> int:
+    try:
+        main = import_module(module).main
+    except ModuleNotFoundError as error:
+        if (error.name or '').split('.')[0] not in ('rclpy', 'rcl_interfaces', 'sensor_msgs'):
+            raise
+        print(
+            f"splatam_ros: no ROS 2 in this Python ({error}): pip install 'splatam_ros[ros]', or source "
+            '/opt/ros/jazzy/setup.bash',
+            file=sys.stderr,
+        )
+        return _EXIT_USAGE
+    return main()
