@@ -182,7 +182,7 @@ def demo(source: str | None, out: Path) -> None:
 
 
 def stop(number: int, frame: FrameType | None) -> None:
-    """Let SIGTERM end the demo as Ctrl-C does: with its processes."""
+    """End the demo with its processes."""
     raise KeyboardInterrupt
 
 
@@ -194,7 +194,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument('--out', type=Path, default=Path('out/demo'), help='folder of the run (default: %(default)s)')
     args = parser.parse_args(arguments)
-    signal.signal(signal.SIGTERM, stop)
+    for number in (signal.SIGINT, signal.SIGTERM):  # a shell's background jobs would ignore SIGINT
+        signal.signal(number, stop)
     try:
         demo(args.source, args.out)
         print(f'look at    {args.out}/report.png, and map.ply, trajectory.txt, metrics.json beside it')
