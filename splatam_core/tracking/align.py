@@ -91,7 +91,7 @@ def _reference(camera: PinholeCamera, render: Render, silhouette_threshold: floa
 def _levels(picture: _Picture) -> list[_Picture]:
     """The picture at a half, a quarter, ...; itself where it is too small for that.
 
-    The full resolution would cost three quarters of the work and gain nothing.
+    The full resolution would be three quarters of the work.
     """
     return list(_halvings(picture)) or [picture]
 
