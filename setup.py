@@ -20,7 +20,7 @@ if sys.version_info < (3, 10):  # noqa: UP036
 
 NAME = 'splatam_ros'
 TOP_LEVEL = (NAME, 'splatam_core', 'msg_adapters')
-CSRC = 'splatam_core/rasterizer/csrc'
+CSRC = 'splatam_core/csrc'
 PACKAGE_XML = ElementTree.parse('package.xml').getroot()
 SYSTEM_PYBIND11 = Path('/usr/include/pybind11/pybind11.h')
 
@@ -71,7 +71,7 @@ class BuildNative(build_ext):
 def native_extension() -> Extension:
     """The C++ kernels of the ``cpu`` rasterizer."""
     return Extension(
-        'splatam_core.rasterizer._native',
+        'splatam_core._native',
         sources=sorted(glob(f'{CSRC}/*.cpp')),
         depends=sorted(glob(f'{CSRC}/*.[hi]*')),
         include_dirs=pybind11_include_dirs() or [],
@@ -88,7 +88,6 @@ def shared_files() -> list[tuple[str, list[str]]]:
         'share/ament_index/resource_index/packages': [f'resource/{NAME}'],
         share: ['package.xml', 'LICENSE'],
         f'{share}/launch': glob(f'{NAME}/launch/*.launch.py'),
-        f'{share}/rviz': glob(f'{NAME}/rviz/*.rviz'),
     }
     for path in Path('config').rglob('*'):
         if path.is_file():
@@ -118,8 +117,9 @@ setup(
         'tqdm>=4.60',
     ],
     extras_require={
+        'exr': ['OpenEXR>=3.3'],
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
-        'test': ['pytest>=7', 'hypothesis>=6'],
+        'test': ['pytest>=7', 'hypothesis>=6', 'OpenEXR>=3.3'],
     },
     entry_points={
         'console_scripts': [

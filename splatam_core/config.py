@@ -101,11 +101,11 @@ class TrackingConfig:
 
     method: str = _setting(
         'render_and_compare',
-        "The paper's Adam through the renderer, or Gauss-Newton alignment to one render.",
-        choices=('render_and_compare', 'align'),
+        "The paper's Adam through the renderer, Gauss-Newton alignment to one render, or the expected pose as it is.",
+        choices=('render_and_compare', 'align', 'none'),
     )
     iterations: int = _setting(40, 'Steps per frame; of alignment, at most per resolution.', '', 0)
-    renders: int = _setting(1, 'Of alignment: how often to render anew and align again.', '', 1)
+    exposure: bool = _setting(True, "Of alignment: take up changes of the camera's exposure.")
     rotation_rate: float = _setting(4e-4, 'Adam step of the unit quaternion.', '', 0.0)
     translation_rate: float = _setting(2e-3, 'Adam step of the translation.', 'm', 0.0)
     color_weight: float = _setting(0.5, 'Weight of the colour L1.', '', 0.0)
@@ -130,6 +130,10 @@ class TrackingConfig:
 class DensificationConfig:
     """Where a frame adds Gaussians (paper, section 3.3)."""
 
+    every: int = _setting(1, 'Add on every n-th frame of those that are mapped.', 'frames', 1)
+    when_unsure: float = _setting(
+        0.0, 'Add on other frames too, where a smaller share of the pixels with depth sees sure map.', '', 0.0, 1.0
+    )
     scale: float = _setting(1.0, 'Resolution at which Gaussians are added, relative to the frame.', '', 0.05, 1.0)
     silhouette_threshold: float = _setting(0.5, 'Add where the silhouette is below this.', '', 0.0, 1.0)
     depth_error_ratio: float = _setting(
@@ -147,6 +151,9 @@ class KeyframeConfig:
 
     every: int = _setting(5, 'Keep every n-th frame.', 'frames', 1)
     window: int = _setting(24, 'Views in a mapping window, the current frame included.', 'frames', 1)
+    current_share: float = _setting(
+        0.0, 'Share of the steps that fit the current frame; 0 = as many as any other view of the window.', '', 0.0, 1.0
+    )
     overlap_samples: int = _setting(1600, 'Pixels sampled to measure overlap with a keyframe.', 'px', 1)
     overlap_margin: int = _setting(20, 'Border of a keyframe in which a sample does not count as seen.', 'px', 0)
 
@@ -156,8 +163,16 @@ class MappingConfig:
     """Map refinement and pruning (paper, section 3.4)."""
 
     mode: str = _setting('sync', 'Map inside each frame.', choices=('sync',))
+    enabled: bool = _setting(True, 'Add to the map and refine it; off = only find the camera in a map that was loaded.')
     every: int = _setting(1, 'Densify and refine on every n-th frame.', 'frames', 1)
     iterations: int = _setting(60, 'Optimisation steps per mapped frame.', '', 0)
+    first_iterations: int = _setting(0, 'More steps on the first frame.', '', 0)
+    optimizer: str = _setting(
+        'autograd',
+        "The paper's: Adam started anew on every mapped frame; or one native step that renders, compares (L1 only) and "
+        'moves what is visible.',
+        choices=('autograd', 'fused'),
+    )
     color_weight: float = _setting(0.5, 'Weight of the colour loss.', '', 0.0)
     depth_weight: float = _setting(1.0, 'Weight of the depth L1.', '', 0.0)
     ssim_weight: float = _setting(0.2, 'Share of 1 - SSIM in the colour loss; the rest is L1.', '', 0.0, 1.0)
@@ -169,6 +184,9 @@ class MappingConfig:
     prune_until: int = _setting(20, 'Last step of a frame that may prune.', 'steps', 0)
     prune_opacity: float = _setting(0.005, 'Prune Gaussians fainter than this.', '', 0.0, 1.0)
     prune_scale: float = _setting(0.1, 'Prune Gaussians wider than this share of the scene radius.', '', 0.0)
+    prune_share: float = _setting(
+        0.0, 'Of fused fitting: prune only once this share of the map is to go; the map is copied then.', '', 0.0, 1.0
+    )
     scene_radius_ratio: float = _setting(3.0, 'Scene radius = deepest reading of the first frame / this.', '', 0.1)
 
 

@@ -74,6 +74,12 @@ def peak_rss_mb() -> float | None:
     return None if peak is None else round(int(peak.split()[0]) / 1024, 1)
 
 
+def rss_mb() -> float | None:
+    """Memory the process holds now; None where the system does not say."""
+    held = _fields(Path('/proc/self/status')).get('VmRSS')
+    return int(held.split()[0]) / 1024 if held else None
+
+
 def _fields(path: Path) -> dict[str, str]:
     """The ``name: value`` lines of a file in /proc; nothing where there is no such file."""
     if not path.exists():

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from splatam_core.rasterizer import Gaussians
+from splatam_core.rasterizer import Gaussians, Moments, Rates
+from splatam_core.rasterizer.base import BETA_1, BETA_2, BLOCK, EPSILON
 from splatam_core.types import MapSnapshot
 
 PARAMETERS = ('means', 'log_scales', 'logit_opacities', 'rgb')
@@ -18,7 +17,8 @@ PARAMETERS = ('means', 'log_scales', 'logit_opacities', 'rgb')
 class GaussianMap:
     """Isotropic Gaussians in world coordinates.
 
-    Only ``append`` and ``keep`` change how many there are; ``keep`` takes the optimiser's moments along.
+    Only ``append`` and ``keep`` change how many there are; ``keep`` takes the optimiser's moments along. There is room for
+    more than there are, so that a growing map is not copied each time.
 
     Attributes:
         means: [N, 3] metres.
@@ -27,12 +27,20 @@ class GaussianMap:
         rgb: [N, 3], nominally in [0, 1].
     """
 
+    means: Tensor
+    log_scales: Tensor
+    logit_opacities: Tensor
+    rgb: Tensor
+
     def __init__(self) -> None:
-        self.means = torch.empty(0, 3)
-        self.log_scales = torch.empty(0, 1)
-        self.logit_opacities = torch.empty(0)
-        self.rgb = torch.empty(0, 3)
+        self._size = 0
+        self._room = {
+            'means': torch.empty(0, 3), 'log_scales': torch.empty(0, 1), 'logit_opacities': torch.empty(0),
+            'rgb': torch.empty(0, 3), 'first_second': torch.empty(0, 16), 'steps': torch.empty(0, dtype=torch.uint8),
+        }  # fmt: skip
+        self._bounds = torch.empty(0, 7)
         self._optimizer: torch.optim.Adam | None = None
+        self._show()
 
     @classmethod
     def from_arrays(
@@ -45,39 +53,50 @@ class GaussianMap:
         return result
 
     def __len__(self) -> int:
-        return len(self.means)
+        return self._size
 
     @property
     def gaussians(self) -> Gaussians:
         """The parameters themselves, as a rasterizer takes them; they carry gradients while being optimised."""
-        return Gaussians(self.means, self.log_scales, self.logit_opacities, self.rgb)
+        bounds = self._bounds if self._optimizer is None else None
+        return Gaussians(self.means, self.log_scales, self.logit_opacities, self.rgb, bounds)
+
+    @property
+    def moments(self) -> Moments:
+        """Of the steps that a rasterizer takes itself (``Rasterizer.fit``); they live as long as their Gaussians."""
+        return Moments(self._room['first_second'][: self._size], self._room['steps'][: self._size])
 
     def append(self, new: Gaussians) -> None:
         """Add Gaussians. Ends an optimisation that was under way."""
         self.stop_optimization()
+        old_size, self._size = self._size, self._size + len(new)
+        self._make_room()
         for name in PARAMETERS:
-            setattr(self, name, torch.cat([getattr(self, name), getattr(new, name)]))
+            self._room[name][old_size : self._size] = getattr(new, name)
+        for name in ('first_second', 'steps'):
+            self._room[name][old_size : self._size] = 0
+        self._show()
+        self._measure(old_size // BLOCK)
 
     def keep(self, kept: Tensor) -> None:
         """Drop all Gaussians but those where ``kept`` [N] is true; gradients and moments of the others stay."""
-        for name in PARAMETERS:
-            old = getattr(self, name)
-            new = old.detach()[kept].requires_grad_(old.requires_grad)
-            new.grad = None if old.grad is None else old.grad[kept]
-            setattr(self, name, new)
-            if self._optimizer is not None:
-                _replace_parameter(self._optimizer, old, new, kept)
+        old = {name: getattr(self, name) for name in PARAMETERS}
+        size, self._size = self._size, int(kept.sum())
+        for values in self._room.values():
+            values[: self._size] = values[:size][kept]
+        self._show()
+        self._measure(0)
+        if self._optimizer is not None:
+            for name in PARAMETERS:
+                new = getattr(self, name).requires_grad_()
+                new.grad = None if old[name].grad is None else old[name].grad[kept]
+                _replace_parameter(self._optimizer, old[name], new, kept)
 
-    def start_optimization(self, rates: Mapping[str, float]) -> None:
-        """Begin with fresh moments, as the paper does for every frame.
-
-        Args:
-            rates: Adam's step size by parameter name.
-        """
-        for name in PARAMETERS:
-            setattr(self, name, getattr(self, name).detach().requires_grad_())
-        groups = [{'params': [getattr(self, name)], 'lr': rates[name]} for name in PARAMETERS]
-        self._optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
+    def start_optimization(self, rates: Rates) -> None:
+        """Begin with fresh moments, as the paper does for every frame."""
+        self._show()
+        groups = [{'params': [getattr(self, name).requires_grad_()], 'lr': getattr(rates, name)} for name in PARAMETERS]
+        self._optimizer = torch.optim.Adam(groups, betas=(BETA_1, BETA_2), eps=EPSILON, fused=True)
 
     def step(self) -> None:
         """Move along the gradients collected since the last step."""
@@ -87,9 +106,10 @@ class GaussianMap:
 
     def stop_optimization(self) -> None:
         """Cut the parameters off from autograd."""
-        self._optimizer = None
-        for name in PARAMETERS:
-            setattr(self, name, getattr(self, name).detach())
+        if self._optimizer is not None:
+            self._optimizer = None
+            self._show()
+            self._measure(0)
 
     def snapshot(self) -> MapSnapshot:
         """A copy that later changes of the map leave alone."""
@@ -100,6 +120,34 @@ class GaussianMap:
                 torch.sigmoid(self.logit_opacities).numpy(force=True),
                 self.log_scales.numpy(force=True).copy(),
             )
+
+    def _show(self) -> None:
+        """Let the parameters be the used part of the room, without gradients."""
+        for name in PARAMETERS:
+            setattr(self, name, self._room[name][: self._size])
+
+    def _make_room(self) -> None:
+        if self._size <= len(self._room['means']):
+            return
+        room = self._size + self._size // 2
+        for name, old in self._room.items():
+            new = old.new_empty(room, *old.shape[1:])
+            new[: len(old)] = old
+            self._room[name] = new
+
+    def _measure(self, first_block: int) -> None:
+        """Find the bounds of the blocks from one on."""
+        begin = first_block * BLOCK
+        starts = np.arange(0, self._size - begin, BLOCK)
+        if len(starts) == 0:
+            self._bounds = self._bounds[:first_block]
+            return
+        means, log_scales = self.means[begin:].detach().numpy(), self.log_scales[begin:].detach().numpy()
+        measured = np.concatenate(
+            [np.minimum.reduceat(means, starts), np.maximum.reduceat(means, starts), np.maximum.reduceat(log_scales, starts)],
+            axis=1,
+        )
+        self._bounds = torch.cat([self._bounds[:first_block], torch.from_numpy(measured)])
 
 
 def _replace_parameter(optimizer: torch.optim.Adam, old: Tensor, new: Tensor, kept: Tensor) -> None:

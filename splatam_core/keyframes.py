@@ -36,7 +36,8 @@ def select_window(
     if not keyframes or config.window == 1:
         return [current]
     points = sample_points(current, config.overlap_samples, rng)
-    overlapping = [k for k in keyframes[:-1] if overlap(points, k, config.overlap_margin) > 0]
+    seen = overlaps(points, keyframes[:-1], config.overlap_margin)
+    overlapping = [k for k, share in zip(keyframes, seen) if share > 0]
     count = min(max(0, config.window - 2), len(overlapping))
     chosen = rng.permutation(len(overlapping))[:count]
     return [*(overlapping[i] for i in chosen), keyframes[-1], current]
@@ -52,10 +53,20 @@ def sample_points(posed: PosedView, count: int, rng: np.random.Generator) -> Ten
     return (points - posed.T_cam_world[:3, 3]) @ posed.T_cam_world[:3, :3]
 
 
-def overlap(points: Tensor, posed: PosedView, margin: int) -> float:
-    """Share of world points [K, 3] that project inside a view, more than ``margin`` pixels from its border."""
-    camera = posed.view.camera
-    x, y, z = (points @ posed.T_cam_world[:3, :3].T + posed.T_cam_world[:3, 3]).unbind(1)
+def overlaps(points: Tensor, keyframes: Sequence[PosedView], margin: int) -> list[float]:
+    """Share of world points [K, 3] that project inside each view, more than ``margin`` pixels from its border."""
+    if not len(points) or not keyframes:
+        return [0.0] * len(keyframes)
+    camera = keyframes[0].view.camera
+    T = torch.stack([keyframe.T_cam_world[:3] for keyframe in keyframes])  # [N, 3, 4]
+    x, y, z = (T[:, :, :3] @ points.T + T[:, :, 3:]).unbind(1)  # [N, K] each
     u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     inside = (u > margin) & (u < camera.width - margin) & (v > margin) & (v < camera.height - margin) & (z > 0)
-    return float(inside.float().mean()) if len(points) else 0.0
+    return inside.float().mean(dim=1).tolist()
+
+
+def draw(window: Sequence[PosedView], config: KeyframeConfig, rng: np.random.Generator) -> PosedView:
+    """One view of a window, whose last is the current one."""
+    if config.current_share == 0 or len(window) == 1:
+        return window[rng.integers(len(window))]
+    return window[-1] if rng.random() < config.current_share else window[rng.integers(len(window) - 1)]

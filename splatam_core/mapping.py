@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from splatam_core.config import MappingConfig
+from splatam_core.config import MappingConfig, SlamConfig
 from splatam_core.gaussian_map import GaussianMap
-from splatam_core.keyframes import PosedView
+from splatam_core.keyframes import PosedView, draw
 from splatam_core.losses import mapping_loss
-from splatam_core.rasterizer import Rasterizer
+from splatam_core.rasterizer import Rasterizer, Rates, Target
 
 
 def refine(
     gaussian_map: GaussianMap,
     window: Sequence[PosedView],
     rasterizer: Rasterizer,
-    config: MappingConfig,
+    config: SlamConfig,
     scene_radius: float,
     rng: np.random.Generator,
+    more: int = 0,
 ) -> None:
     """Fit the map to the window, pruning on the way.
 
@@ -32,17 +34,24 @@ def refine(
         config: steps, weights, rates, pruning.
         scene_radius: metres; Gaussians are too wide relative to it.
         rng: draws the view of each step.
+        more: steps on top of the configured ones.
     """
-    gaussian_map.start_optimization(
-        {
-            'means': config.means_rate,
-            'log_scales': config.scale_rate,
-            'logit_opacities': config.opacity_rate,
-            'rgb': config.rgb_rate,
-        }
-    )
-    for step in range(config.iterations):
-        posed = window[rng.integers(len(window))]
+    fit = _fit_fused if config.mapping.optimizer == 'fused' else _fit_by_autograd
+    views = (draw(window, config.keyframes, rng) for _ in range(config.mapping.iterations + more))
+    fit(gaussian_map, views, rasterizer, config.mapping, scene_radius)
+
+
+def rates(config: MappingConfig) -> Rates:
+    """Adam's."""
+    return Rates(config.means_rate, config.scale_rate, config.opacity_rate, config.rgb_rate)
+
+
+def _fit_by_autograd(
+    gaussian_map: GaussianMap, views: Iterable[PosedView], rasterizer: Rasterizer, config: MappingConfig,
+    scene_radius: float,
+) -> None:  # fmt: skip
+    gaussian_map.start_optimization(rates(config))
+    for step, posed in enumerate(views):
         render = rasterizer.render(gaussian_map.gaussians, posed.view.camera, posed.T_cam_world)
         mapping_loss(render, posed.view, config.ssim_weight, config.color_weight, config.depth_weight).backward()
         if config.prune_every and step % config.prune_every == 0 and step <= config.prune_until:
@@ -51,8 +60,32 @@ def refine(
     gaussian_map.stop_optimization()
 
 
+def _fit_fused(
+    gaussian_map: GaussianMap, views: Iterable[PosedView], rasterizer: Rasterizer, config: MappingConfig,
+    scene_radius: float,
+) -> None:  # fmt: skip
+    for posed in views:
+        view = posed.view
+        target = Target(
+            view.camera, view.rgb8, view.depth, posed.T_cam_world, config.color_weight, config.depth_weight
+        )
+        rasterizer.fit(gaussian_map.gaussians, gaussian_map.moments, rates(config), target)
+    if config.prune_every:
+        chosen = prunable(gaussian_map, config, scene_radius)
+        if chosen.sum() > config.prune_share * len(gaussian_map):
+            gaussian_map.keep(~chosen)
+
+
 def prunable(gaussian_map: GaussianMap, config: MappingConfig, scene_radius: float) -> Tensor:
     """[N] Gaussians that are too faint to matter or too wide to be surface."""
-    faint = torch.sigmoid(gaussian_map.logit_opacities.detach()) < config.prune_opacity
-    wide = gaussian_map.log_scales.detach().amax(dim=1).exp() > config.prune_scale * scene_radius
+    faint = gaussian_map.logit_opacities.detach() < _logit(config.prune_opacity)
+    wide = gaussian_map.log_scales.detach().amax(dim=1) > _log(config.prune_scale * scene_radius)
     return faint | wide
+
+
+def _logit(p: float) -> float:
+    return _log(p) - _log(1 - p)
+
+
+def _log(x: float) -> float:
+    return math.log(x) if x > 0 else -math.inf

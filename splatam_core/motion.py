@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core import se3
 
 Matrix = NDArray[np.float64]
+# Pose [4, 4] of the camera at the second stamp (ns) in the camera at the first, by another sensor; None: not known.
+MotionPrior = Callable[[int, int], 'Matrix | None']
 
 
 class MotionModel:
-    """Carries the camera's last motion on, by stamps: gaps between frames may differ.
+    """Asks another sensor how the camera moved; else carries its last motion on, by stamps: gaps may differ.
 
     Args:
         constant_velocity: whether to carry motion on, or stay at the last pose.
+        prior: the other sensor.
     """
 
-    def __init__(self, constant_velocity: bool) -> None:
+    def __init__(self, constant_velocity: bool, prior: MotionPrior | None = None) -> None:
         self._constant_velocity = constant_velocity
+        self._prior = prior
         self._stamp_ns = 0
         self._T_world_cam: Matrix = np.eye(4)
         self._velocity = np.zeros(6)  # twist per second, in the camera's frame
@@ -30,6 +36,8 @@ class MotionModel:
 
     def predict(self, stamp_ns: int) -> Matrix:
         """[4, 4] camera to world at a stamp."""
+        if self._prior and self._stamp_ns and (step := self._prior(self._stamp_ns, stamp_ns)) is not None:
+            return self._T_world_cam @ step
         return self._T_world_cam @ se3.exp(self._velocity * (stamp_ns - self._stamp_ns) * 1e-9)
 
     def observe(self, stamp_ns: int, T_world_cam: Matrix) -> None:
@@ -38,6 +46,11 @@ class MotionModel:
             step = se3.log(se3.inverse(self._T_world_cam) @ T_world_cam)
             self._velocity = step / ((stamp_ns - self._stamp_ns) * 1e-9)
         self._stamp_ns, self._T_world_cam = stamp_ns, T_world_cam
+
+    def place(self, T_world_cam: Matrix) -> None:
+        """Be at a pose, at rest, whatever the time: the next stamp may be any."""
+        self.stop()
+        self._stamp_ns, self._T_world_cam = 0, T_world_cam
 
     def stop(self) -> None:
         """Forget the velocity: nobody knows how a lost camera moves."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -17,8 +17,8 @@ from splatam_core.errors import FrameError, SplatamError
 from splatam_core.gaussian_map import GaussianMap
 from splatam_core.keyframes import PosedView, select_window
 from splatam_core.mapping import refine
-from splatam_core.motion import MotionModel
-from splatam_core.rasterizer import make_rasterizer
+from splatam_core.motion import MotionModel, MotionPrior
+from splatam_core.rasterizer import Gaussians, make_rasterizer
 from splatam_core.tracking import make_tracker
 from splatam_core.types import FrameResult, MapSnapshot, RenderedView, RgbdFrame, StageTimings, Status
 from splatam_core.view import View
@@ -29,10 +29,11 @@ Matrix = NDArray[np.float64]
 class Slam:
     """The algorithm, synchronous and without threads of its own."""
 
-    def __init__(self, config: SlamConfig) -> None:
+    def __init__(self, config: SlamConfig, motion_prior: MotionPrior | None = None) -> None:
         self.config = config
+        self._motion_prior = motion_prior
         self._rasterizer = make_rasterizer(config.rasterizer, config.threads)
-        self._tracker = make_tracker(self._rasterizer, config.tracking)
+        self._tracker = make_tracker(self._rasterizer, config.tracking, config.threads)
         self.reset()
 
     def reset(self) -> None:
@@ -40,7 +41,7 @@ class Slam:
         self.map = GaussianMap()
         self.camera: PinholeCamera | None = None
         self._keyframes: list[PosedView] = []
-        self._motion = MotionModel(self.config.tracking.motion_model == 'constant_velocity')
+        self._motion = MotionModel(self.config.tracking.motion_model == 'constant_velocity', self._motion_prior)
         self._rng = np.random.default_rng(self.config.seed)
         self._scene_radius = 0.0
         self._num_frames = 0
@@ -74,9 +75,30 @@ class Slam:
 
         T_world_cam = se3.inverse(tracking.T_cam_world)
         self._motion.observe(frame.stamp_ns, T_world_cam)
-        is_keyframe = self._map(index, _posed(view, tracking.T_cam_world), clock)
+        is_keyframe = self._map(index, _posed(view, tracking.T_cam_world), tracking.sure_fraction, clock)
         return self._result(index, frame, Status.TRACKED, T_world_cam, is_keyframe, clock, '',
                             tracking.sure_fraction, tracking.inlier_fraction)  # fmt: skip
+
+    def configure(self, config: SlamConfig) -> None:
+        """Use other settings from the next frame on; seed, threads, rasterizer and motion model stay as they are."""
+        self.config = config
+        self._tracker = make_tracker(self._rasterizer, config.tracking, config.threads)
+
+    def load(self, gaussians: Gaussians, T_world_cam: Matrix) -> None:
+        """Go on in a map made earlier.
+
+        Args:
+            gaussians: the map.
+            T_world_cam: [4, 4] about where the camera is in it.
+        """
+        self.reset()
+        self.map.append(gaussians)
+        self._motion.place(T_world_cam)
+
+    def rest(self) -> None:
+        """Take the camera to be where it was last, at rest; the next frame may have any stamp."""
+        self._motion.place(self._motion.last_pose)
+        self._last_stamp_ns = None
 
     def render(self, T_world_cam: Matrix) -> RenderedView:
         """What the map looks like from a pose, through the frames' camera.
@@ -107,29 +129,35 @@ class Slam:
         self.camera = frame.camera
 
     def _initialize(self, index: int, frame: RgbdFrame, view: View, clock: _Stopwatch) -> FrameResult:
-        if not view.valid.any():
-            reason = 'the map cannot start: no pixel has a usable depth reading'
+        if not (view.valid.any() and self.config.mapping.enabled):
+            reason = 'no pixel has a usable depth reading' if self.config.mapping.enabled else 'mapping.enabled is off'
+            reason = f'the map cannot start: {reason}'
             return self._result(index, frame, Status.LOST, None, False, clock, reason, 0.0, 0.0)
-        self._scene_radius = float(view.depth.max()) / self.config.mapping.scene_radius_ratio
         self._motion.observe(frame.stamp_ns, np.eye(4))
-        self._map(0, _posed(view, np.eye(4)), clock)
+        self._map(0, _posed(view, np.eye(4)), 0.0, clock)
         return self._result(index, frame, Status.INITIALIZED, np.eye(4), True, clock, '', 1.0, 1.0)
 
-    def _map(self, index: int, current: PosedView, clock: _Stopwatch) -> bool:
+    def _map(self, index: int, current: PosedView, sure_fraction: float, clock: _Stopwatch) -> bool:
         """Densify, choose a window, refine; keep the view if it is due. Whether it was."""
         config = self.config
-        if index % config.mapping.every == 0:
-            self.map.append(
-                densify(self.map.gaussians, current.view, current.T_cam_world, self._rasterizer, config.densification)
-            )
-            clock.lap('densify')
+        if not config.mapping.enabled:
+            return False
+        self._scene_radius = self._scene_radius or float(current.view.depth.max()) / config.mapping.scene_radius_ratio
+        mapped, every = divmod(index, config.mapping.every)
+        if every == 0:
+            if mapped % config.densification.every == 0 or sure_fraction < config.densification.when_unsure:
+                self.map.append(
+                    densify(self.map.gaussians, current.view, current.T_cam_world, self._rasterizer, config.densification)
+                )
+                clock.lap('densify')
             window = select_window(current, self._keyframes, config.keyframes, self._rng)
             clock.lap('keyframes')
-            refine(self.map, window, self._rasterizer, config.mapping, self._scene_radius, self._rng)
+            more = config.mapping.first_iterations if index == 0 else 0
+            refine(self.map, window, self._rasterizer, config, self._scene_radius, self._rng, more)
             clock.lap('map')
         is_keyframe = index % config.keyframes.every == 0
         if is_keyframe:
-            self._keyframes.append(current)
+            self._keyframes.append(replace(current, view=replace(current.view)))  # leaves behind what the view has cached
         return is_keyframe
 
     def _result(

@@ -22,12 +22,14 @@ class RgbdFrame:
         rgb: [H, W, 3] uint8, RGB.
         depth_m: [H, W] float32 metres along the optical axis; 0 = no reading, never NaN or inf.
         camera: the pinhole both images were taken with (or rectified to).
+        epoch: how often time had jumped back before; stamps increase within an epoch.
     """
 
     stamp_ns: int
     rgb: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
     camera: PinholeCamera
+    epoch: int = 0
 
 
 class Status(str, Enum):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -10,48 +11,49 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatam_core.camera import PinholeCamera
+from splatam_core.camera import PinholeCamera, kept
 from splatam_core.config import DepthConfig
 from splatam_core.types import RgbdFrame
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class View:
-    """One frame's images.
+    """One frame's images, stored compactly: keyframes are many.
 
     Attributes:
-        camera: the pinhole of all three.
-        rgb: [3, H, W] in [0, 1].
+        camera: the pinhole of both.
+        rgb8: [H, W, 3] uint8.
         depth: [H, W] metres, 0 = no reading.
-        valid: [H, W] bool, where there is a reading.
     """
 
     camera: PinholeCamera
-    rgb: Tensor
+    rgb8: Tensor
     depth: Tensor
-    valid: Tensor
 
     @classmethod
     def from_frame(cls, frame: RgbdFrame, config: DepthConfig) -> View:
         """The frame's images, with only the depth readings that count."""
-        return cls._from_images(frame.camera, frame.rgb, usable_depth(frame.depth_m, config))
+        depth_m = usable_depth(frame.depth_m, config)
+        return cls(frame.camera, torch.from_numpy(np.ascontiguousarray(frame.rgb)), torch.from_numpy(depth_m))
 
-    @classmethod
-    def _from_images(cls, camera: PinholeCamera, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> View:
-        colour = torch.from_numpy(rgb).permute(2, 0, 1).float().div_(255).contiguous()
-        depth = torch.from_numpy(depth_m)
-        return cls(camera, colour, depth, depth > 0)
+    @cached_property
+    def rgb(self) -> Tensor:
+        """[3, H, W] in [0, 1]."""
+        return self.rgb8.permute(2, 0, 1).float().div_(255).contiguous()
+
+    @cached_property
+    def valid(self) -> Tensor:
+        """[H, W] bool, where there is a reading."""
+        return self.depth > 0
 
     def scaled(self, scale: float) -> View:
         """The same view at another resolution: colour by area, depth by nearest."""
         if scale == 1.0:
             return self
         size = max(1, round(self.camera.width * scale)), max(1, round(self.camera.height * scale))
-        rgb = cv2.resize(self.rgb.permute(1, 2, 0).numpy(), size, interpolation=cv2.INTER_AREA)
+        rgb8 = cv2.resize(self.rgb8.numpy(), size, interpolation=cv2.INTER_AREA)
         depth = cv2.resize(self.depth.numpy(), size, interpolation=cv2.INTER_NEAREST_EXACT)
-        depth_tensor = torch.from_numpy(depth)
-        colour = torch.from_numpy(rgb).permute(2, 0, 1).contiguous()
-        return View(self.camera.resized(*size), colour, depth_tensor, depth_tensor > 0)
+        return View(self.camera.resized(*size), torch.from_numpy(rgb8), torch.from_numpy(depth))
 
     def points(self, chosen: Tensor) -> Tensor:
         """[K, 3] camera coordinates of the pixels where ``chosen`` [H, W] is true, row by row."""
@@ -69,7 +71,7 @@ def usable_depth(depth_m: NDArray[np.float32], config: DepthConfig) -> NDArray[n
     usable = (depth_m >= config.min_m) & (depth_m <= config.max_m)
     if config.edge_filter > 0:
         usable &= ~_is_flying(depth_m, config.edge_filter)
-    return np.where(usable, depth_m, np.float32(0))
+    return kept(depth_m, usable)
 
 
 def _is_flying(depth_m: NDArray[np.float32], ratio: float) -> NDArray[np.bool_]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from splatam_core.rasterizer.base import Gaussians, Rasterizer, Render, joined
+from splatam_core.rasterizer.base import Gaussians, Moments, Rasterizer, Rates, Render, Target, joined
 
-__all__ = ['Gaussians', 'Rasterizer', 'Render', 'joined', 'make_rasterizer']
+__all__ = ['Gaussians', 'Moments', 'Rasterizer', 'Rates', 'Render', 'Target', 'joined', 'make_rasterizer']
 
 
 def make_rasterizer(name: str, threads: int = 0) -> Rasterizer:

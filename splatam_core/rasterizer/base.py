@@ -9,7 +9,7 @@ Centres at z <= 0.2 m are not drawn. The background is black. Where alpha is cla
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -22,6 +22,8 @@ BLUR_PX2 = 0.3
 MAX_ALPHA = 0.99
 MIN_ALPHA = 1.0 / 255.0
 MIN_TRANSMITTANCE = 1e-4
+BLOCK = 1024
+BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,12 +35,15 @@ class Gaussians:
         log_scales: [N, 1] log metres: isotropic.
         logit_opacities: [N].
         rgb: [N, 3], not clamped.
+        bounds: [ceil(N / BLOCK), 7] of each run of BLOCK Gaussians the smallest mean, the largest mean and the largest log
+            scale, so that a rasterizer may skip what is out of view; None where nobody has looked.
     """
 
     means: Tensor
     log_scales: Tensor
     logit_opacities: Tensor
     rgb: Tensor
+    bounds: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.means)
@@ -46,13 +51,58 @@ class Gaussians:
     def detached(self) -> Gaussians:
         """The same values, cut off from autograd."""
         return Gaussians(
-            self.means.detach(), self.log_scales.detach(), self.logit_opacities.detach(), self.rgb.detach()
+            self.means.detach(), self.log_scales.detach(), self.logit_opacities.detach(), self.rgb.detach(), self.bounds
         )
 
 
 def joined(first: Gaussians, second: Gaussians) -> Gaussians:
-    """Both, the first's before the second's."""
-    return Gaussians(*(torch.cat([getattr(g, f.name) for g in (first, second)]) for f in fields(Gaussians)))
+    """Both, the first's before the second's; without bounds."""
+    names = 'means', 'log_scales', 'logit_opacities', 'rgb'
+    return Gaussians(*(torch.cat([getattr(first, name), getattr(second, name)]) for name in names))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moments:
+    """Of Adam, Gaussian by Gaussian: each has been stepped as often as it was seen.
+
+    Attributes:
+        first_second: [N, 16] running means of the gradients of mean, log scale, logit opacity and rgb; of their squares.
+        steps: [N] uint8, counted to 255.
+    """
+
+    first_second: Tensor
+    steps: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """Adam's step sizes by parameter."""
+
+    means: float
+    log_scales: float
+    logit_opacities: float
+    rgb: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Target:
+    """What the map should look like from a pose.
+
+    Attributes:
+        camera: the image's.
+        rgb8: [H, W, 3] uint8.
+        depth: [H, W] metres, 0 = no reading.
+        T_cam_world: [4, 4] float32.
+        color_weight: of the mean absolute difference of colour, over pixels and channels.
+        depth_weight: of that of depth_acc, over readings.
+    """
+
+    camera: PinholeCamera
+    rgb8: Tensor
+    depth: Tensor
+    T_cam_world: Tensor
+    color_weight: float
+    depth_weight: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,5 +135,13 @@ class Rasterizer(Protocol):
             gaussians: what to draw.
             camera: the image to draw.
             T_cam_world: [4, 4] world to camera; its upper three rows receive gradients entry by entry.
+        """
+        ...
+
+    def fit(self, gaussians: Gaussians, moments: Moments, rates: Rates, target: Target) -> float:
+        """Take one Adam step towards a target, in place; Gaussians that get no gradient stay as they are.
+
+        Returns:
+            The loss before the step.
         """
         ...

@@ -5,15 +5,17 @@ from __future__ import annotations
 import os
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from splatam_core.camera import PinholeCamera
 from splatam_core.errors import RasterizerError
-from splatam_core.rasterizer.base import Gaussians, Render
+from splatam_core.rasterizer.base import Gaussians, Moments, Rates, Render, Target
 
 try:
-    from splatam_core.rasterizer import _native
+    from splatam_core import _native
 except ImportError as error:
     raise RasterizerError(
         f"the CPU rasterizer's native module cannot be loaded ({error}); build it with 'pip install .' "
@@ -41,9 +43,26 @@ class CpuRasterizer:
         return Render(
             *_Splat.apply(
                 gaussians.means.contiguous(), gaussians.log_scales.contiguous(),
-                gaussians.logit_opacities.contiguous(), gaussians.rgb.contiguous(), T_cam_world, self._engine, camera,
+                gaussians.logit_opacities.contiguous(), gaussians.rgb.contiguous(), T_cam_world, gaussians.bounds,
+                self._engine, camera,
             )
         )  # fmt: skip
+
+    def fit(self, gaussians: Gaussians, moments: Moments, rates: Rates, target: Target) -> float:
+        """See ``Rasterizer.fit``. One native call: nothing of it passes through autograd."""
+        _check(gaussians, target.T_cam_world)
+        camera, readings = target.camera, max(1, int(torch.count_nonzero(target.depth)))
+        return self._engine.fit(
+            gaussians.means.numpy(), gaussians.log_scales.numpy(), gaussians.logit_opacities.numpy(),
+            gaussians.rgb.numpy(), _array(gaussians.bounds), moments.first_second.numpy(), moments.steps.numpy(),
+            (rates.means, rates.log_scales, rates.logit_opacities, rates.rgb), target.T_cam_world.numpy(),
+            camera.fx, camera.fy, camera.cx, camera.cy, target.rgb8.numpy(), target.depth.numpy(),
+            target.color_weight / (3 * camera.width * camera.height), target.depth_weight / readings,
+        )  # fmt: skip
+
+
+def _array(tensor: Tensor | None) -> NDArray[np.float32] | None:
+    return None if tensor is None else tensor.numpy()
 
 
 def _check(gaussians: Gaussians, T_cam_world: Tensor) -> None:
@@ -68,6 +87,7 @@ class _Splat(torch.autograd.Function):
         logit_opacities: Tensor,
         rgb: Tensor,
         T_cam_world: Tensor,
+        bounds: Tensor | None,
         engine: _native.Engine,
         camera: PinholeCamera,
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -76,7 +96,7 @@ class _Splat(torch.autograd.Function):
         inputs = means, log_scales, logit_opacities, rgb
         ctx.view = engine.forward(
             *(tensor.detach().numpy() for tensor in inputs), T_cam_world.detach().numpy(),
-            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
+            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, _array(bounds),
             *(image.numpy() for image in images),
         )  # fmt: skip
         ctx.engine = engine
@@ -97,4 +117,4 @@ class _Splat(torch.autograd.Function):
             [slope.contiguous().numpy() for slope in slopes],
             *(None if gradient is None else gradient.numpy() for gradient in gradients), pose.numpy(),
         )  # fmt: skip
-        return *gradients, pose if ctx.needs_input_grad[4] else None, None, None
+        return *gradients, pose if ctx.needs_input_grad[4] else None, None, None, None

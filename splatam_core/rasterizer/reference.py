@@ -7,13 +7,19 @@ from torch import Tensor
 
 from splatam_core.camera import PinholeCamera
 from splatam_core.rasterizer.base import (
+    BETA_1,
+    BETA_2,
     BLUR_PX2,
+    EPSILON,
     MAX_ALPHA,
     MIN_ALPHA,
     MIN_TRANSMITTANCE,
     NEAR_M,
     Gaussians,
+    Moments,
+    Rates,
     Render,
+    Target,
 )
 
 _MAX_CELLS = 20_000_000  # Gaussian-pixel pairs held at once
@@ -42,6 +48,33 @@ class ReferenceRasterizer:
         ]
         image = torch.cat(bands, dim=1)  # [5, H, W]
         return Render(image[:3], image[3], image[4])
+
+    def fit(self, gaussians: Gaussians, moments: Moments, rates: Rates, target: Target) -> float:
+        """See ``Rasterizer.fit``."""
+        values = [gaussians.means, gaussians.log_scales, gaussians.logit_opacities[:, None], gaussians.rgb]
+        packed = torch.cat(values, dim=1).detach().requires_grad_()  # [N, 8]
+        means, log_scales, logits, rgb = packed.split([3, 1, 1, 3], dim=1)
+        loss = _l1(self.render(Gaussians(means, log_scales, logits[:, 0], rgb), target.camera, target.T_cam_world), target)
+        (gradient,) = torch.autograd.grad(loss, packed)
+        seen = (gradient != 0).any(dim=1)
+        gradient = gradient[seen]
+        moments.steps[seen] += (moments.steps[seen] < 255).to(torch.uint8)
+        step = moments.steps[seen, None].to(gradient.dtype)
+        first, second = moments.first_second[seen].to(gradient.dtype).split(8, dim=1)
+        first, second = BETA_1 * first + (1 - BETA_1) * gradient, BETA_2 * second + (1 - BETA_2) * gradient**2
+        moments.first_second[seen] = torch.cat([first, second], dim=1).to(moments.first_second.dtype)
+        rate = torch.tensor([rates.means] * 3 + [rates.log_scales, rates.logit_opacities] + [rates.rgb] * 3)
+        move = rate * (first / (1 - BETA_1**step)) / ((second / (1 - BETA_2**step)).sqrt() + EPSILON)
+        for value, moved in zip(values, move.split([3, 1, 1, 3], dim=1), strict=True):
+            value[seen] -= moved.to(value.dtype)
+        return loss.item()
+
+
+def _l1(render: Render, target: Target) -> Tensor:
+    color = (render.rgb - target.rgb8.permute(2, 0, 1) / 255).abs().mean()
+    read = target.depth > 0
+    depth = ((render.depth_acc - target.depth).abs() * read).sum() / read.sum().clamp(min=1)
+    return target.color_weight * color + target.depth_weight * depth
 
 
 def _blend(

@@ -6,13 +6,14 @@ from splatam_core.config import TrackingConfig
 from splatam_core.rasterizer import Rasterizer
 from splatam_core.tracking.align import AlignmentTracker
 from splatam_core.tracking.base import Tracker, TrackingResult
+from splatam_core.tracking.none import NullTracker
 from splatam_core.tracking.render_and_compare import RenderAndCompareTracker
 
-__all__ = ['AlignmentTracker', 'RenderAndCompareTracker', 'Tracker', 'TrackingResult', 'make_tracker']
+__all__ = ['AlignmentTracker', 'NullTracker', 'RenderAndCompareTracker', 'Tracker', 'TrackingResult', 'make_tracker']
 
-_TRACKERS = {'render_and_compare': RenderAndCompareTracker, 'align': AlignmentTracker}
+_TRACKERS = {'render_and_compare': RenderAndCompareTracker, 'align': AlignmentTracker, 'none': NullTracker}
 
 
-def make_tracker(rasterizer: Rasterizer, config: TrackingConfig) -> Tracker:
+def make_tracker(rasterizer: Rasterizer, config: TrackingConfig, threads: int = 0) -> Tracker:
     """The tracker that the configuration names."""
-    return _TRACKERS[config.method](rasterizer, config)
+    return _TRACKERS[config.method](rasterizer, config, threads)

@@ -1,4 +1,4 @@
-"""What every tracker returns, and how a tracked pose is judged."""
+"""What every tracker returns, and when it counts as lost."""
 
 from __future__ import annotations
 
@@ -81,13 +81,20 @@ def judge(T_cam_world: NDArray[np.float64], render: Render, view: View, config: 
     num_sure = int(sure.sum())
     sure_fraction = num_sure / max(1, readings)
     inlier_fraction = int((sure & depth_agrees & color_agrees).sum()) / max(1, num_sure)
-    failure = ''
+    reason = failure(T_cam_world, readings, sure_fraction, inlier_fraction, config)
+    return TrackingResult(T_cam_world, sure_fraction, inlier_fraction, reason)
+
+
+def failure(
+    T_cam_world: NDArray[np.float64], readings: int, sure_fraction: float, inlier_fraction: float, config: TrackingConfig
+) -> str:
+    """Why a pose must not be used; empty where it may be."""
     if not np.isfinite(T_cam_world).all():
-        failure = 'tracking diverged: the pose is not finite'
-    elif readings == 0:
-        failure = 'no pixel has a usable depth reading'
-    elif sure_fraction < config.min_sure_fraction:
-        failure = f'only {sure_fraction:.0%} of the view is mapped (at least {config.min_sure_fraction:.0%} needed)'
-    elif inlier_fraction < config.min_inlier_fraction:
-        failure = f'only {inlier_fraction:.0%} of it agrees with the map (at least {config.min_inlier_fraction:.0%} needed)'
-    return TrackingResult(T_cam_world, sure_fraction, inlier_fraction, failure)
+        return 'tracking diverged: the pose is not finite'
+    if readings == 0:
+        return 'no pixel has a usable depth reading'
+    if sure_fraction < config.min_sure_fraction:
+        return f'only {sure_fraction:.0%} of the view is mapped (at least {config.min_sure_fraction:.0%} needed)'
+    if inlier_fraction < config.min_inlier_fraction:
+        return f'only {inlier_fraction:.0%} of it agrees with the map (at least {config.min_inlier_fraction:.0%} needed)'
+    return ''

@@ -18,7 +18,7 @@ from splatam_core.view import View
 class RenderAndCompareTracker:
     """Keeps the best pose of all it evaluated, the first guess included."""
 
-    def __init__(self, rasterizer: Rasterizer, config: TrackingConfig) -> None:
+    def __init__(self, rasterizer: Rasterizer, config: TrackingConfig, threads: int = 0) -> None:
         self._rasterizer = rasterizer
         self._config = config
 

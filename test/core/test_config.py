@@ -22,6 +22,26 @@ def test_presets_state_the_papers_numbers() -> None:
     assert (tum.tracking.iterations, tum.mapping.iterations, tum.tracking.rotation_rate) == (200, 30, 2e-3)
 
 
+@pytest.mark.parametrize(
+    ('preset', 'tracking', 'mapping', 'window', 'scale'),
+    [
+        ('replica', (40, 4e-4, 2e-3), 60, 24, 1.0),
+        ('replica_v2', (40, 4e-4, 2e-3), 60, 24, 1.0),
+        ('splatam_s', (10, 4e-4, 2e-3), 15, 32, 0.5),
+        ('tum', (200, 2e-3, 2e-3), 30, 20, 1.0),
+        ('scannet', (100, 5e-4, 5e-4), 30, 10, 1.0),
+        ('scannetpp', (200, 1e-3, 4e-3), 60, 24, 1.0),
+        ('iphone', (60, 1e-3, 4e-3), 60, 32, 0.5),
+    ],
+)
+def test_presets_are_the_originals_configurations(preset, tracking, mapping, window, scale) -> None:
+    config = load_config(preset)
+    t = config.tracking
+    assert (t.iterations, t.rotation_rate, t.translation_rate) == tracking
+    assert (config.mapping.iterations, config.keyframes.window, config.densification.scale) == (mapping, window, scale)
+    assert (config.mapping.every, config.keyframes.every, t.silhouette_threshold) == (1, 5, 0.99)
+
+
 def test_overrides_win_over_the_preset() -> None:
     config = load_config('splatam_s', ['tracking.iterations=7', 'mapping.means_rate=1e-3', 'seed=3'])
     assert (config.tracking.iterations, config.mapping.means_rate, config.seed) == (7, 1e-3, 3)

@@ -12,12 +12,13 @@ from splatam_core.rasterizer import Render
 from splatam_core.view import View
 
 CAMERA = PinholeCamera(6, 4, 5.0, 5.0, 3.0, 2.0)
+GRAY = torch.full((4, 6, 3), 102, dtype=torch.uint8)  # 0.4
 
 
 def _view() -> View:
     depth = torch.full((4, 6), 2.0)
     depth[0] = 0.0
-    return View(CAMERA, torch.full((3, 4, 6), 0.5), depth, depth > 0)
+    return View(CAMERA, GRAY, depth)
 
 
 def _render(rgb: float, depth: float, silhouette: torch.Tensor) -> Render:
@@ -27,21 +28,21 @@ def _render(rgb: float, depth: float, silhouette: torch.Tensor) -> Render:
 def test_tracking_loss_sums_where_the_map_is_sure_and_depth_is_read() -> None:
     silhouette = torch.zeros(4, 6)
     silhouette[:, :3] = 1.0
-    loss = tracking_loss(_render(0.6, 2.3, silhouette), _view(), 0.99, 0.5, 1.0)
+    loss = tracking_loss(_render(0.5, 2.3, silhouette), _view(), 0.99, 0.5, 1.0)
     pixels = 3 * 3  # three columns sure, three rows with depth
     assert loss.num_pixels == pixels
     assert float(loss.total) == pytest.approx(pixels * (1.0 * 0.3 + 0.5 * 3 * 0.1), rel=1e-5)
 
 
 def test_mapping_loss_means_depth_over_readings_and_colour_over_all() -> None:
-    loss = mapping_loss(_render(0.6, 2.3, torch.zeros(4, 6)), _view(), 0.0, 0.5, 1.0)
+    loss = mapping_loss(_render(0.5, 2.3, torch.zeros(4, 6)), _view(), 0.0, 0.5, 1.0)
     assert float(loss) == pytest.approx(0.3 + 0.5 * 0.1, rel=1e-5)
 
 
 def test_mapping_loss_of_a_view_without_depth_is_the_colour_loss() -> None:
     depth = torch.zeros(4, 6)
-    view = View(CAMERA, torch.full((3, 4, 6), 0.5), depth, depth > 0)
-    loss = mapping_loss(_render(0.6, 2.3, torch.zeros(4, 6)), view, 0.0, 0.5, 1.0)
+    view = View(CAMERA, GRAY, depth)
+    loss = mapping_loss(_render(0.5, 2.3, torch.zeros(4, 6)), view, 0.0, 0.5, 1.0)
     assert float(loss) == pytest.approx(0.05, rel=1e-5)
 
 

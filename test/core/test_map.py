@@ -3,31 +3,32 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from splatam_core.camera import PinholeCamera
-from splatam_core.config import DensificationConfig, KeyframeConfig, MappingConfig
+from splatam_core.config import DensificationConfig, KeyframeConfig, MappingConfig, load_config
 from splatam_core.densification import densify, new_gaussians, unexplained
 from splatam_core.gaussian_map import PARAMETERS, GaussianMap
-from splatam_core.keyframes import PosedView, overlap, select_window
+from splatam_core.keyframes import PosedView, draw, overlaps, select_window
 from splatam_core.mapping import prunable, refine
-from splatam_core.rasterizer import Render, make_rasterizer
+from splatam_core.rasterizer import Gaussians, Rates, Render, make_rasterizer
 from splatam_core.view import View
 
 CAMERA = PinholeCamera(32, 24, 30.0, 30.0, 15.5, 11.5)
 EYE = torch.eye(4)
-RATES = {'means': 1e-4, 'log_scales': 1e-3, 'logit_opacities': 0.05, 'rgb': 2.5e-3}
+RATES = Rates(means=1e-4, log_scales=1e-3, logit_opacities=0.05, rgb=2.5e-3)
 
 
 def _view(depth_m: float = 2.0) -> View:
     """A wall with a smooth pattern."""
     v, u = torch.meshgrid(torch.arange(24.0), torch.arange(32.0), indexing='ij')
     rgb = torch.stack([0.5 + 0.4 * torch.sin(u / 3), 0.5 + 0.4 * torch.cos(v / 4), 0.5 + 0.01 * u])
-    depth = torch.full((24, 32), depth_m)
-    return View(CAMERA, rgb, depth, depth > 0)
+    rgb8 = rgb.mul(255).round().byte().permute(1, 2, 0).contiguous()
+    return View(CAMERA, rgb8, torch.full((24, 32), depth_m))
 
 
 def _map(view: View) -> GaussianMap:
@@ -89,7 +90,7 @@ def test_densification_adds_what_stands_in_front_of_the_map() -> None:
     depth = wall.depth + 0.002 * torch.randn(24, 32, generator=generator)
     depth[8:16, 8:16] = 1.2
     depth[0:2] = 0.0  # no reading: must neither count in the median nor be added
-    view = View(CAMERA, wall.rgb, depth, depth > 0)
+    view = View(CAMERA, wall.rgb8, depth)
     render = make_rasterizer('cpu', 1).render(_map(wall).gaussians, CAMERA, EYE)
     chosen = unexplained(render, view, DensificationConfig())
     assert chosen[8:16, 8:16].all()
@@ -109,7 +110,7 @@ def test_settled_gaussians_render_at_the_depth_they_were_read_at() -> None:
     """On a floor seen at a grazing angle, blending front to back favours the nearer neighbours; settling undoes that."""
     v = torch.arange(24.0)[:, None].expand(24, 32)
     depth = (1.0 / (0.3 + 0.01 * v)).contiguous()  # a plane: inverse depth is linear in the image
-    view = View(CAMERA, torch.full((3, 24, 32), 0.5), depth, depth > 0)
+    view = View(CAMERA, torch.full((24, 32, 3), 128, dtype=torch.uint8), depth)
     rasterizer = make_rasterizer('cpu', 1)
     bias = []
     for rounds in (0, 3):
@@ -120,10 +121,11 @@ def test_settled_gaussians_render_at_the_depth_they_were_read_at() -> None:
     assert abs(bias[1]) < 0.2 * abs(bias[0])
 
 
-def test_mapping_makes_the_render_look_like_the_view() -> None:
+@pytest.mark.parametrize('optimizer', ['autograd', 'fused'])
+def test_mapping_makes_the_render_look_like_the_view(optimizer: str) -> None:
     view = _view()
     gaussian_map = _map(view)
-    gaussian_map.rgb = gaussian_map.rgb * 0.7
+    gaussian_map.rgb *= 0.7
     rasterizer = make_rasterizer('cpu', 1)
 
     def error(render: Render) -> float:
@@ -131,9 +133,20 @@ def test_mapping_makes_the_render_look_like_the_view() -> None:
 
     before = error(rasterizer.render(gaussian_map.gaussians, CAMERA, EYE))
     window = [PosedView(view, EYE)]
-    refine(gaussian_map, window, rasterizer, MappingConfig(iterations=60), 1.0, np.random.default_rng(0))
+    config = load_config(overrides={'mapping.iterations': 60, 'mapping.optimizer': optimizer})
+    refine(gaussian_map, window, rasterizer, config, 1.0, np.random.default_rng(0))
     after = error(rasterizer.render(gaussian_map.gaussians, CAMERA, EYE))
     assert after < 0.5 * before
+
+
+@pytest.mark.parametrize('optimizer', ['autograd', 'fused'])
+def test_mapping_prunes_on_the_way(optimizer: str) -> None:
+    view = _view()
+    gaussian_map = _map(view)
+    gaussian_map.logit_opacities[::4] = -8.0
+    config = load_config(overrides={'mapping.iterations': 3, 'mapping.optimizer': optimizer})
+    refine(gaussian_map, [PosedView(view, EYE)], make_rasterizer('cpu', 1), config, 10.0, np.random.default_rng(0))
+    assert len(gaussian_map) == 24 * 32 * 3 // 4
 
 
 def test_pruning_drops_the_faint_and_the_wide() -> None:
@@ -180,10 +193,53 @@ def test_snapshot_stays_as_it_was() -> None:
 def test_overlap_is_the_share_seen_inside_the_margin() -> None:
     view = _view()
     points = view.points(view.valid)
-    assert overlap(points, PosedView(view, EYE), 0) == pytest.approx(1.0, abs=0.1)  # the outermost pixels are on the rim
-    assert overlap(points, PosedView(view, EYE), 8) == pytest.approx(15 * 7 / 768, abs=0.01)
-    assert overlap(points, PosedView(view, _at(0.0, math.pi)), 0) == 0.0
-    assert overlap(points[:0], PosedView(view, EYE), 0) == 0.0
+    here, behind = PosedView(view, EYE), PosedView(view, _at(0.0, math.pi))
+    assert overlaps(points, [here, behind], 0) == pytest.approx([1.0, 0.0], abs=0.1)  # the outermost are on the rim
+    assert overlaps(points, [here], 8) == pytest.approx([15 * 7 / 768], abs=0.01)
+    assert overlaps(points[:0], [here], 0) == [0.0]
+    assert overlaps(points, [], 0) == []
+
+
+def test_the_current_view_gets_its_share_of_the_steps() -> None:
+    view = _view()
+    window = [PosedView(view, _at(0.01 * k)) for k in range(9)]
+    rng = np.random.default_rng(0)
+    for share, expected in ((0.0, 1 / 9), (0.25, 0.25), (1.0, 1.0)):
+        drawn = [draw(window, KeyframeConfig(current_share=share), rng) is window[-1] for _ in range(2000)]
+        assert np.mean(drawn) == pytest.approx(expected, abs=0.04)  # four standard deviations of 2000 draws
+
+
+def test_gaussians_out_of_view_are_skipped_without_a_trace() -> None:
+    """Bounds change nothing but time: with and without them the images are the same, bit for bit."""
+    generator = torch.Generator().manual_seed(0)
+    rasterizer = make_rasterizer('cpu', 2)
+    gaussian_map = GaussianMap()
+    for _ in range(20):
+        where = 6 * torch.rand(3, generator=generator) - 3
+        n = int(torch.randint(1, 1500, (1,), generator=generator))
+        means = where + 0.5 * torch.randn(n, 3, generator=generator)
+        log_scales = -4 + 2 * torch.rand(n, 1, generator=generator)
+        rgb = torch.rand(n, 3, generator=generator)
+        gaussian_map.append(Gaussians(means, log_scales, torch.randn(n, generator=generator), rgb))
+    gaussian_map.keep(torch.rand(len(gaussian_map), generator=generator) > 0.1)
+    bounded = gaussian_map.gaussians
+    assert bounded.bounds is not None and len(bounded.bounds) == -(-len(gaussian_map) // 1024)
+    unbounded = replace(bounded, bounds=None)
+    for k in range(12):
+        pose = _at(0.5 * k - 3, 0.5 * k)
+        first, second = (rasterizer.render(gaussians, CAMERA, pose) for gaussians in (bounded, unbounded))
+        assert torch.equal(first.rgb, second.rgb) and torch.equal(first.silhouette, second.silhouette)
+
+
+def test_bounds_follow_what_fitting_moves() -> None:
+    gaussian_map = _map(_view())
+    config = load_config(overrides={'mapping.iterations': 20, 'mapping.optimizer': 'fused', 'mapping.means_rate': 0.01})
+    away = PosedView(_view(1.5), EYE)
+    refine(gaussian_map, [away], make_rasterizer('cpu', 2), config, 10.0, np.random.default_rng(0))
+    bounds = gaussian_map.gaussians.bounds
+    assert bounds is not None
+    assert (gaussian_map.means >= bounds[0, :3]).all() and (gaussian_map.means <= bounds[0, 3:6]).all()
+    assert gaussian_map.log_scales.max() <= bounds[0, 6]
 
 
 def test_window_holds_overlapping_keyframes_the_last_and_the_current() -> None:

@@ -57,6 +57,16 @@ def test_tracks_every_frame_of_the_room(room: tuple[list[RgbdFrame], list[np.nda
         assert np.degrees(np.linalg.norm(se3.rotation_vector(error[:3, :3]))) < 0.5
 
 
+def test_without_a_tracker_the_camera_is_where_it_was_expected(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """Nothing moves the prediction, so it stays at the start; covered frames change nothing about that."""
+    frames, _ = room
+    slam = _slam('tracking.method=none', 'mapping.every=1000000')
+    first, *others = [slam.process(frame) for frame in [*frames[:3], _covered(frames[3], frames[3].stamp_ns)]]
+    assert [result.status for result in others] == [Status.TRACKED] * 3
+    assert all(np.array_equal(result.T_world_cam, np.eye(4)) for result in others)
+    assert {result.num_gaussians for result in others} == {first.num_gaussians}
+
+
 def test_the_map_renders_like_the_frames(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
     """The render of a mapped view resembles it, in colour and depth."""
     frames, _ = room
@@ -190,6 +200,58 @@ def test_trackers_find_a_known_motion(
     assert np.linalg.norm(se3.rotation_vector(result.T_cam_world[:3, :3])) < radians
 
 
+def test_alignment_takes_up_what_the_exposure_does(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """With three fifths of the light the map does not look like the frame, unless gain and bias are found too."""
+    frames, _ = room
+    slam = _slam('mapping.iterations=30')
+    slam.process(frames[0])
+    darker = dataclasses.replace(frames[0], rgb=(0.6 * frames[0].rgb).astype(np.uint8))
+    view = View.from_frame(darker, slam.config.depth)
+    off = se3.exp(np.array([0.015, -0.01, 0.008, 0.01, -0.012, 0.008]))
+    with_exposure, without = (
+        make_tracker(make_rasterizer('cpu', 1), TrackingConfig(method='align', iterations=6, exposure=exposure)).track(
+            view, slam.map.gaussians, off
+        )
+        for exposure in (True, False)
+    )
+    assert not with_exposure.failure and with_exposure.inlier_fraction > 0.95
+    assert np.linalg.norm(with_exposure.T_cam_world[:3, 3]) < 0.0045  # as under equal light (see above), and rounding
+    assert 'agrees with the map' in without.failure
+
+
+def test_alignment_to_a_blank_wall_stays_where_it_was_told(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """Nothing tells where along it the camera is; least of all may the steps run away."""
+    frames, _ = room
+    blank = dataclasses.replace(frames[0], rgb=np.full_like(frames[0].rgb, 128), depth_m=np.full_like(frames[0].depth_m, 1.5))
+    slam = _slam('mapping.iterations=30', 'tracking.method=align')
+    slam.process(blank)
+    result = slam.process(dataclasses.replace(blank, stamp_ns=blank.stamp_ns + 33_000_000))
+    assert result.status is Status.TRACKED
+    np.testing.assert_allclose(result.T_world_cam, np.eye(4), atol=2e-3)
+
+
+@pytest.mark.parametrize('threads', [1, 3])
+def test_alignment_is_repeatable(threads: int, room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    frames, _ = room
+    runs = []
+    for _ in range(2):
+        slam = Slam(load_config('realtime', [f'threads={threads}']))
+        runs.append([slam.process(frame).T_world_cam for frame in frames])
+        runs[-1].append(slam.snapshot().means)
+    for one, other in zip(*runs, strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_keyframes_keep_no_more_than_the_images(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """Seven bytes a pixel; what a view works out on the way is not carried along for good."""
+    frames, _ = room
+    slam = Slam(load_config('realtime', ['threads=1']))
+    for frame in frames:
+        slam.process(frame)
+    for keyframe in slam._keyframes:
+        assert set(vars(keyframe.view)) == {'camera', 'rgb8', 'depth'}
+
+
 def test_tracking_never_returns_a_pose_worse_than_its_guess(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
     """The guess itself is a candidate: absurd step sizes cannot spoil a perfect one."""
     frames, _ = room
@@ -247,3 +309,51 @@ def test_depth_range() -> None:
     frame = RgbdFrame(1, np.zeros((1, 4, 3), np.uint8), depth, PinholeCamera(4, 1, 4.0, 4.0, 1.5, 0.0))
     config = load_config('quick', {'depth.min_m': 0.4, 'depth.max_m': 4.0}).depth
     assert View.from_frame(frame, config).valid.tolist() == [[False, True, True, False]]
+
+
+def test_a_map_made_earlier_is_gone_on_in(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """From a pose nearby; with mapping off it stays as it is, with mapping on it grows from the next frame on."""
+    frames, truth = room
+    first = _slam('mapping.every=1')
+    for frame in frames:
+        first.process(frame)
+    gaussians = first.map.gaussians.detached()
+    slam = _slam('mapping.enabled=false')
+    slam.load(gaussians, truth[8])
+    result = slam.process(frames[9])
+    assert result.status is Status.TRACKED and not result.is_keyframe
+    assert np.linalg.norm(result.T_world_cam[:3, 3] - truth[9][:3, 3]) < 0.015  # as when it was made
+    assert torch.equal(slam.map.means, gaussians.means)
+    slam.configure(load_config('quick', ['threads=1', 'mapping.every=1']))
+    slam.process(dataclasses.replace(frames[9], stamp_ns=frames[9].stamp_ns + 10**8))
+    assert not torch.equal(slam.map.means, gaussians.means)
+
+
+def test_without_mapping_no_map_begins(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    slam = _slam('mapping.enabled=false')
+    result = slam.process(room[0][0])
+    assert result.status is Status.LOST and 'mapping.enabled is off' in result.reason and slam.num_gaussians == 0
+
+
+def test_at_rest_the_next_frame_may_have_any_stamp(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    frames, truth = room
+    slam = _slam('mapping.every=1')
+    for frame in frames[:4]:
+        slam.process(frame)
+    slam.rest()
+    result = slam.process(dataclasses.replace(frames[3], stamp_ns=5))
+    assert result.status is Status.TRACKED
+    assert np.linalg.norm(result.T_world_cam[:3, 3] - truth[3][:3, 3]) < 0.015
+    assert slam.process(dataclasses.replace(frames[3], stamp_ns=10**8)).status is Status.TRACKED
+
+
+def test_a_camera_that_was_placed_is_at_rest() -> None:
+    motion = MotionModel(constant_velocity=True)
+    moved, elsewhere = (se3.exp(np.array([x, 0, 0, 0, 0, 0])) for x in (1.0, 7.0))
+    motion.observe(10**9, np.eye(4))
+    motion.observe(2 * 10**9, moved)
+    motion.place(elsewhere)
+    for stamp_ns in (1, 3 * 10**9):
+        np.testing.assert_array_equal(motion.predict(stamp_ns), elsewhere)
+    motion.observe(5, moved)  # earlier than what was seen before: no velocity is made of it
+    np.testing.assert_array_equal(motion.predict(10**9), moved)

@@ -1,70 +1,4 @@
-// Included once per instruction set, inside a namespace and a target region. Uses no std templates: an inline
-// function compiled here for a newer processor must never be the one the linker keeps for all.
-
-typedef float Lanes __attribute__((vector_size(32)));
-typedef std::int32_t IntLanes __attribute__((vector_size(32)));
-
-static inline Lanes splat(float value) { return Lanes{} + value; }
-
-static inline Lanes iota() { return Lanes{0, 1, 2, 3, 4, 5, 6, 7}; }
-
-static inline Lanes min(Lanes a, Lanes b) { return a < b ? a : b; }
-
-static inline Lanes max(Lanes a, Lanes b) { return a > b ? a : b; }
-
-static inline Lanes load(const float* from) {
-  Lanes value;
-  __builtin_memcpy(&value, from, sizeof value);
-  return value;
-}
-
-static inline void store(float* to, Lanes value) { __builtin_memcpy(to, &value, sizeof value); }
-
-// exp of at most 88: 2^n times a Taylor polynomial on half an octave (relative error about 1e-7).
-static inline Lanes exp(Lanes x) {
-  x = max(x, splat(-87.0f));
-  const Lanes shifter = splat(12582912.0f);  // 1.5 * 2^23: adding it rounds to a whole number
-  const Lanes n = (x * 1.44269504f + shifter) - shifter;
-  const Lanes r = (x - n * 0.693359375f) + n * 2.12194440e-4f;  // ln 2 in two parts
-  Lanes p = splat(1.0f / 720);
-  p = p * r + 1.0f / 120;
-  p = p * r + 1.0f / 24;
-  p = p * r + 1.0f / 6;
-  p = p * r + 0.5f;
-  p = p * r + 1.0f;
-  p = p * r + 1.0f;
-  return p * (Lanes)((__builtin_convertvector(n, IntLanes) + 127) << 23);
-}
-
-// An upper bound of ln x, at most 0.012 above it, for normal x.
-static inline Lanes log_bound(Lanes x) {
-  const IntLanes bits = (IntLanes)x;
-  const Lanes exponent = __builtin_convertvector((bits >> 23) - 127, Lanes);
-  const Lanes m = (Lanes)((bits & 0x007fffff) | 0x3f800000);  // [1, 2)
-  const Lanes log2_m = (m - 1.0f) * (splat(1.68f) - 0.34f * m) + 0.009f;
-  return (exponent + log2_m) * 0.693147181f;
-}
-
-static inline Lanes keep(IntLanes mask, Lanes a) { return mask ? a : Lanes{}; }
-
-static inline Lanes sqrt(Lanes x) {
-  Lanes root;
-  for (int i = 0; i < 8; ++i) root[i] = __builtin_sqrtf(x[i]);
-  return root;
-}
-
-// Lane i of the result is the sum of the lanes of rows[i].
-static inline Lanes row_sums(const Lanes* rows) {
-  Lanes a[4], b[2];
-  for (int i = 0; i < 4; ++i)
-    a[i] = __builtin_shufflevector(rows[2 * i], rows[2 * i + 1], 0, 8, 2, 10, 4, 12, 6, 14) +
-           __builtin_shufflevector(rows[2 * i], rows[2 * i + 1], 1, 9, 3, 11, 5, 13, 7, 15);
-  for (int i = 0; i < 2; ++i)
-    b[i] = __builtin_shufflevector(a[2 * i], a[2 * i + 1], 0, 1, 8, 9, 4, 5, 12, 13) +
-           __builtin_shufflevector(a[2 * i], a[2 * i + 1], 2, 3, 10, 11, 6, 7, 14, 15);
-  return __builtin_shufflevector(b[0], b[1], 0, 1, 2, 3, 8, 9, 10, 11) +
-         __builtin_shufflevector(b[0], b[1], 4, 5, 6, 7, 12, 13, 14, 15);
-}
+// Included once per instruction set, inside a namespace and a target region, after lanes.inl.
 
 static inline float clamp(float x, float low, float high) { return x < low ? low : x > high ? high : x; }
 
@@ -290,4 +224,156 @@ static void backward(const TileList& tile, const Splat* splats, const Camera& ca
     backward_tile<true>(tile, splats, camera, drawn, gradient, gradients);
   else
     backward_tile<false>(tile, splats, camera, drawn, gradient, gradients);
+}
+
+static_assert(sizeof(Footprint) == kFloatsPerPrint * sizeof(float), "scratch is allocated elsewhere");
+
+static inline Lanes load_bytes(const std::uint8_t* pixels, int columns, int channel) {
+  Lanes values{};
+  for (int i = 0; i < columns; ++i) values[i] = float(pixels[3 * i + channel]);
+  return values * (1.0f / 255.0f);
+}
+
+static inline Lanes sign(Lanes x) { return x > 0.0f ? splat(1.0f) : x < 0.0f ? splat(-1.0f) : Lanes{}; }
+
+struct RowGradient {
+  Lanes r, g, b, depth;
+};
+
+// L1 of one row, its gradient, and what the gradient sums to over the row's splats (Q of backward_tile).
+static inline double compare(const Row& drawn, const TileList& tile, const Camera& camera, int row, const Target& target,
+                             RowGradient& gradient, Lanes& Q) {
+  gradient = RowGradient{};
+  Q = Lanes{};
+  if (tile.y + row >= camera.height) return 0.0;
+  const int columns = camera.width - tile.x < 8 ? camera.width - tile.x : 8;
+  const std::size_t at = std::size_t(tile.y + row) * camera.width + tile.x;
+  const IntLanes real = iota() < float(columns);
+  Lanes depth{};
+  __builtin_memcpy(&depth, target.depth + at, sizeof(float) * columns);
+  const Lanes red = keep(real, drawn.r - load_bytes(target.rgb + 3 * at, columns, 0));
+  const Lanes green = keep(real, drawn.g - load_bytes(target.rgb + 3 * at, columns, 1));
+  const Lanes blue = keep(real, drawn.b - load_bytes(target.rgb + 3 * at, columns, 2));
+  const Lanes range = keep(real & (depth > 0.0f), drawn.depth - depth);
+  gradient.r = target.color_weight * sign(red);
+  gradient.g = target.color_weight * sign(green);
+  gradient.b = target.color_weight * sign(blue);
+  gradient.depth = target.depth_weight * sign(range);
+  Q = gradient.r * drawn.r + gradient.g * drawn.g + gradient.b * drawn.b + gradient.depth * drawn.depth;
+  const Lanes loss = gradient.r * red + gradient.g * green + gradient.b * blue + gradient.depth * range;
+  double total = 0.0;
+  for (int i = 0; i < 8; ++i) total += loss[i];
+  return total;
+}
+
+static double fit(const TileList& tile, const Splat* splats, const Camera& camera, const Target& target, float* scratch,
+                  SplatGradient* gradients) {
+  constexpr std::size_t kBatch = 16;
+  Footprint* prints = reinterpret_cast<Footprint*>(scratch);
+  Row rows[kTile] = {};
+  for (int row = 0; row < kTile; ++row) rows[row].T = keep(on_image(tile, camera, row), splat(1.0f));
+  Splat batch[kBatch];
+  std::size_t count = 0;
+  while (count < tile.count && !opaque(rows)) {
+    const std::size_t size = tile.count - count < kBatch ? tile.count - count : kBatch;
+    for (std::size_t i = 0; i < size; ++i) {
+      batch[i] = splats[tile.splats[count + i]];
+      prints[count + i] = footprint(batch[i], tile);
+    }
+    for (int row = 0; row < kTile; row += 2) {
+      Row upper = rows[row], lower = rows[row + 1];
+      for (std::size_t i = 0; i < size; ++i) {
+        const Footprint& f = prints[count + i];
+        if ((f.down[row] < kMinAlpha) & (f.down[row + 1] < kMinAlpha)) continue;
+        blend(upper, f.down[row] * f.across, batch[i]);
+        blend(lower, f.down[row + 1] * f.across, batch[i]);
+      }
+      rows[row] = upper;
+      rows[row + 1] = lower;
+    }
+    count += size;
+  }
+  double loss = 0.0;
+  Lanes T[kTile], Q[kTile];
+  RowGradient gradient[kTile];
+  for (int row = 0; row < kTile; ++row) loss += compare(rows[row], tile, camera, row, target, gradient[row], Q[row]);
+  start_transmittance(T, tile, camera);
+  for (std::size_t k = 0; k < count; ++k) {
+    const Splat& s = splats[tile.splats[k]];
+    const Footprint& f = prints[k];
+    Lanes sums[8] = {};  // as in SplatGradient
+    Lanes squared_dy{};
+    for (int row = 0; row < kTile; ++row) {
+      if (f.down[row] < kMinAlpha) continue;
+      const RowGradient& g = gradient[row];
+      const Lanes raw = f.down[row] * f.across;
+      const Lanes alpha = min(raw, splat(kMaxAlpha));
+      const IntLanes blended = (alpha >= kMinAlpha) & (T[row] >= kMinTransmittance);
+      const Lanes w = keep(blended, alpha * T[row]);
+      const Lanes q = g.r * s.r + g.g * s.g + g.b * s.b + g.depth * s.z;
+      Q[row] -= w * q;
+      const Lanes slope = keep(blended & (raw <= kMaxAlpha), alpha * (T[row] * q - Q[row] / (1.0f - alpha)));
+      const Lanes slope_dy = slope * f.dy[row];
+      sums[0] += slope;
+      sums[2] += slope_dy;
+      squared_dy += slope_dy * f.dy[row];
+      sums[4] += w * g.r;
+      sums[5] += w * g.g;
+      sums[6] += w * g.b;
+      sums[7] += w * g.depth;
+      T[row] -= w;
+    }
+    sums[1] = sums[0] * f.dx;
+    sums[3] = sums[1] * f.dx + squared_dy;
+    float* into = &gradients[tile.splats[k]].log_alpha;
+    store(into, load(into) + row_sums(sums));
+  }
+  return loss;
+}
+
+constexpr float kBeta1 = 0.9f, kBeta2 = 0.999f, kEpsilon = 1e-15f;
+
+static void update(const Splat* splats, const std::uint32_t* ids, const SplatGradient* gradients, std::size_t begin,
+                   std::size_t end, const Camera& camera, const Pose& pose, const MutableGaussians& gaussians,
+                   const AdamState& adam, const AdamRates& rates, float* bounds) {
+  float left1[256], left2[256];  // what bias correction divides by
+  left1[0] = left2[0] = 1.0f;
+  for (int i = 1; i < 256; ++i) left1[i] = left1[i - 1] * kBeta1, left2[i] = left2[i - 1] * kBeta2;
+  const Lanes rate = {rates.means, rates.means, rates.means, rates.log_scales, rates.logit_opacities,
+                      rates.rgb,   rates.rgb,   rates.rgb};
+  for (std::size_t splat_index = begin; splat_index < end; ++splat_index) {
+    const SplatGradient& g = gradients[splat_index];
+    if (g.log_alpha == 0.0f && g.r == 0.0f && g.g == 0.0f && g.b == 0.0f && g.z == 0.0f) continue;
+    const std::size_t id = ids[splat_index];
+    const GaussianGradient slope = through_projection(splats[splat_index], g, camera);
+    const float *R = pose.R, *d = slope.camera;
+    const Lanes gradient = {R[0] * d[0] + R[3] * d[1] + R[6] * d[2],
+                            R[1] * d[0] + R[4] * d[1] + R[7] * d[2],
+                            R[2] * d[0] + R[5] * d[1] + R[8] * d[2],
+                            slope.log_scale, slope.logit_opacity, g.r, g.g, g.b};
+    float* moments = adam.moments + 16 * id;
+    const Lanes first = kBeta1 * load(moments) + (1.0f - kBeta1) * gradient;
+    const Lanes second = kBeta2 * load(moments + 8) + (1.0f - kBeta2) * gradient * gradient;
+    store(moments, first);
+    store(moments + 8, second);
+    const int step = adam.steps[id] < 255 ? ++adam.steps[id] : 255;
+    const Lanes move = rate * (first / (1.0f - left1[step])) / (sqrt(second / (1.0f - left2[step])) + kEpsilon);
+    float* mean = gaussians.means + 3 * id;
+    float* rgb = gaussians.rgb + 3 * id;
+    for (int axis = 0; axis < 3; ++axis) {
+      mean[axis] -= move[axis];
+      rgb[axis] -= move[5 + axis];
+      if (bounds) {
+        if (mean[axis] < bounds[axis]) bounds[axis] = mean[axis];
+        if (mean[axis] > bounds[3 + axis]) bounds[3 + axis] = mean[axis];
+      }
+    }
+    gaussians.log_scales[id] -= move[3];
+    gaussians.logit_opacities[id] -= move[4];
+    if (bounds && gaussians.log_scales[id] > bounds[6]) bounds[6] = gaussians.log_scales[id];
+  }
+}
+
+static constexpr Kernels table(const char* name) {
+  return {project, forward, backward, fit, update, align, name};
 }

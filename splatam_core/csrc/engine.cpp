@@ -9,7 +9,6 @@
 namespace splatam {
 namespace {
 
-constexpr std::size_t kBlock = 4096;
 constexpr int kDigitBits = 10;  // three digits hold every depth from 0.2 m on
 constexpr std::size_t kDigits = std::size_t(1) << kDigitBits;
 
@@ -23,6 +22,29 @@ std::uint32_t depth_bits(float z) {
   std::memcpy(&bits, &z, sizeof bits);
   std::memcpy(&near, &kNear, sizeof near);
   return bits - near;
+}
+
+// Whether any Gaussian within bounds can reach a pixel.
+bool may_be_seen(const float* bounds, const Camera& camera, const Pose& pose) {
+  constexpr float kReach = 3.34f;       // of a Gaussian, in its own deviations: sqrt(2 ln 255), rounded up
+  constexpr float kBlurReach = 1.84f;   // px: that of the blur alone
+  float centre[3], c[3], squared = 0.0f;
+  for (int axis = 0; axis < 3; ++axis) {
+    centre[axis] = 0.5f * (bounds[axis] + bounds[3 + axis]);
+    const float half = bounds[3 + axis] - centre[axis];
+    squared += half * half;
+  }
+  const float radius = std::sqrt(squared), reach = kReach * camera.focal() * std::exp(std::min(bounds[6], 40.0f));
+  for (int row = 0; row < 3; ++row)
+    c[row] = pose.R[3 * row] * centre[0] + pose.R[3 * row + 1] * centre[1] + pose.R[3 * row + 2] * centre[2] + pose.t[row];
+  if (c[2] + radius <= kNear) return false;
+  // An edge of the image, and the eye, span a plane; a disc may reach over it.
+  const auto inside = [&](float across, float focal, float pixels) {
+    const float along = pixels + kBlurReach;
+    return focal * across + along * c[2] + radius * std::sqrt(focal * focal + along * along) + reach >= 0.0f;
+  };
+  return inside(c[0], camera.fx, camera.cx) && inside(-c[0], camera.fx, float(camera.width - 1) - camera.cx) &&
+         inside(c[1], camera.fy, camera.cy) && inside(-c[1], camera.fy, float(camera.height - 1) - camera.cy);
 }
 
 // Calls visit(tile) for each tile that a splat touches.
@@ -58,23 +80,29 @@ std::shared_ptr<View> Engine::borrow_view() {
   });
 }
 
-std::shared_ptr<View> Engine::forward(const GaussianArrays& gaussians, std::size_t count, const Camera& camera,
-                                      const Pose& pose, const Images& images) {
+std::shared_ptr<View> Engine::forward(const GaussianArrays& gaussians, std::size_t count, const float* bounds,
+                                      const Camera& camera, const Pose& pose, const Images& images) {
   std::lock_guard<std::mutex> lock(mutex_);
+  auto view = list(gaussians, count, bounds, camera, pose);
+  blend(*view, images);
+  return view;
+}
+
+std::shared_ptr<View> Engine::list(const GaussianArrays& gaussians, std::size_t count, const float* bounds,
+                                   const Camera& camera, const Pose& pose) {
   auto view = borrow_view();
   view->camera = camera;
   view->pose = pose;
   view->num_gaussians = count;
   view->tiles_x = (camera.width + kTile - 1) / kTile;
   view->tiles_y = (camera.height + kTile - 1) / kTile;
-  project(*view, gaussians);
+  project(*view, gaussians, bounds);
   sort_by_depth(*view);
   list_tiles(*view);
-  blend(*view, images);
   return view;
 }
 
-void Engine::project(View& view, const GaussianArrays& gaussians) {
+void Engine::project(View& view, const GaussianArrays& gaussians, const float* bounds) {
   const std::size_t count = view.num_gaussians, blocks = blocks_of(count);
   view.splats.resize(count);
   view.rects.resize(count);
@@ -84,6 +112,7 @@ void Engine::project(View& view, const GaussianArrays& gaussians) {
   pool_.run([&](int) {
     for (std::size_t block; (block = next.fetch_add(1)) < blocks;)
       view.block_sizes[block] =
+          bounds && !may_be_seen(bounds + kBounds * block, view.camera, view.pose) ? 0 :
           kernels_.project(gaussians, view.camera, view.pose, block * kBlock, std::min(count, (block + 1) * kBlock),
                            view.splats.data(), view.rects.data(), view.ids.data());
   });
@@ -166,36 +195,45 @@ void Engine::blend(const View& view, const Images& images) {
 
 namespace {
 
-// Back through one projection: from a splat's gradient to its Gaussian's (where wanted) and to the pose's.
+// From a splat's gradient to its Gaussian's (where wanted) and to the pose's.
 void project_backward(const View& view, std::size_t splat, const SplatGradient& g, const GaussianArrays& gaussians,
                       const MapGradients& map, double pose_gradient[12]) {
-  const Splat& s = view.splats[splat];
-  const Camera& camera = view.camera;
   const std::size_t id = view.ids[splat];
-  const float inverse_z = 1.0f / s.z;
-  const float inverse_variance = -2.0f * s.falloff, variance = 1.0f / inverse_variance;
-  const float du = g.dx * inverse_variance, dv = g.dy * inverse_variance;  // dx is pixel minus centre
-  const float dvariance = 0.5f * g.squared * inverse_variance * inverse_variance;
-  const float spread = 2.0f * (variance - kBlur);  // d variance / d log scale
-  const float x_over_z = (s.u - camera.cx) / camera.fx, y_over_z = (s.v - camera.cy) / camera.fy;
-  const float dx = du * camera.fx * inverse_z, dy = dv * camera.fy * inverse_z;
-  const float dz = g.z - dx * x_over_z - dy * y_over_z - dvariance * spread * inverse_z;
-  const float* mean = gaussians.means + 3 * id;
-  const float d[3] = {dx, dy, dz};
+  const GaussianGradient slope = through_projection(view.splats[splat], g, view.camera);
+  const float *mean = gaussians.means + 3 * id, *d = slope.camera;
   for (int row = 0; row < 3; ++row) {
     for (int column = 0; column < 3; ++column) pose_gradient[4 * row + column] += double(d[row]) * mean[column];
     pose_gradient[4 * row + 3] += d[row];
   }
   if (map.means)
     for (int axis = 0; axis < 3; ++axis)
-      map.means[3 * id + axis] = view.pose.R[axis] * dx + view.pose.R[3 + axis] * dy + view.pose.R[6 + axis] * dz;
-  if (map.log_scales) map.log_scales[id] = dvariance * spread;
-  if (map.logit_opacities) map.logit_opacities[id] = g.log_alpha * (1.0f - s.opacity);
+      map.means[3 * id + axis] = view.pose.R[axis] * d[0] + view.pose.R[3 + axis] * d[1] + view.pose.R[6 + axis] * d[2];
+  if (map.log_scales) map.log_scales[id] = slope.log_scale;
+  if (map.logit_opacities) map.logit_opacities[id] = slope.logit_opacity;
   if (map.rgb) {
     map.rgb[3 * id] = g.r;
     map.rgb[3 * id + 1] = g.g;
     map.rgb[3 * id + 2] = g.b;
   }
+}
+
+// One thread's own gradients, zero where splats are.
+SplatGradient* cleared_gradients(View& view, int thread) {
+  SplatGradient* mine = view.gradients.data() + view.num_gaussians * thread;
+  for (std::size_t block = 0; block < view.block_sizes.size(); ++block)
+    std::fill_n(mine + block * kBlock, view.block_sizes[block], SplatGradient{});
+  return mine;
+}
+
+// Of all threads, left with the first.
+const SplatGradient& summed_gradient(View& view, std::size_t splat, int parts) {
+  SplatGradient& sum = view.gradients[splat];
+  for (int thread = 1; thread < parts; ++thread) {
+    const SplatGradient& g = view.gradients[view.num_gaussians * thread + splat];
+    sum.log_alpha += g.log_alpha, sum.dx += g.dx, sum.dy += g.dy, sum.squared += g.squared;
+    sum.r += g.r, sum.g += g.g, sum.b += g.b, sum.z += g.z;
+  }
+  return sum;
 }
 
 // Cuts the tiles into runs of about equal work, always the same ones: sums stay repeatable.
@@ -222,9 +260,7 @@ void Engine::backward(View& view, const GaussianArrays& gaussians, const ConstIm
   const bool any_map = map.means || map.log_scales || map.logit_opacities || map.rgb;
   view.gradients.resize(count * parts);
   pool_.run([&](int thread) {
-    SplatGradient* mine = view.gradients.data() + count * thread;
-    for (std::size_t block = 0; block < blocks; ++block)
-      std::fill_n(mine + block * kBlock, view.block_sizes[block], SplatGradient{});
+    SplatGradient* mine = cleared_gradients(view, thread);
     for (int tile = runs[thread]; tile < runs[thread + 1]; ++tile)
       kernels_.backward(view.tile(tile), view.splats.data(), view.camera, drawn, gradient, any_map, mine);
   });
@@ -234,12 +270,7 @@ void Engine::backward(View& view, const GaussianArrays& gaussians, const ConstIm
     for (std::size_t block; (block = next.fetch_add(1)) < blocks;) {
       pose_sums[block].fill(0.0);
       for (std::size_t splat = block * kBlock; splat < block * kBlock + view.block_sizes[block]; ++splat) {
-        SplatGradient sum{};
-        for (int thread = 0; thread < parts; ++thread) {
-          const SplatGradient& g = view.gradients[count * thread + splat];
-          sum.log_alpha += g.log_alpha, sum.dx += g.dx, sum.dy += g.dy, sum.squared += g.squared;
-          sum.r += g.r, sum.g += g.g, sum.b += g.b, sum.z += g.z;
-        }
+        const SplatGradient& sum = summed_gradient(view, splat, parts);
         project_backward(view, splat, sum, gaussians, map, pose_sums[block].data());
       }
     }
@@ -249,6 +280,45 @@ void Engine::backward(View& view, const GaussianArrays& gaussians, const ConstIm
     for (const auto& block : pose_sums) sum += block[entry];
     pose_gradient[entry] = float(sum);
   }
+}
+
+float* Engine::prints(int thread, std::size_t count) {
+  constexpr std::size_t kVector = 8;  // floats; the kernels want whole vectors aligned
+  auto& room = prints_[thread];
+  if (room.size() < count * kFloatsPerPrint + kVector) room.resize(2 * count * kFloatsPerPrint + kVector);
+  const auto address = reinterpret_cast<std::uintptr_t>(room.data()) / sizeof(float);
+  return room.data() + (kVector - address % kVector) % kVector;
+}
+
+double Engine::fit(const MutableGaussians& gaussians, std::size_t count, float* bounds, const AdamState& adam,
+                   const AdamRates& rates, const Camera& camera, const Pose& pose, const Target& target) {
+  std::lock_guard<std::mutex> lock(mutex_);
+  const GaussianArrays now{gaussians.means, gaussians.log_scales, gaussians.logit_opacities, gaussians.rgb};
+  auto view = list(now, count, bounds, camera, pose);
+  const int parts = pool_.size();
+  const auto runs = balanced_runs(*view, parts);
+  std::vector<double> losses(parts, 0.0);
+  prints_.resize(parts);
+  view->gradients.resize(count * parts);
+  pool_.run([&](int thread) {
+    SplatGradient* mine = cleared_gradients(*view, thread);
+    for (int tile = runs[thread]; tile < runs[thread + 1]; ++tile) {
+      const TileList list = view->tile(tile);
+      losses[thread] += kernels_.fit(list, view->splats.data(), camera, target, prints(thread, list.count), mine);
+    }
+  });
+  std::atomic<std::size_t> next{0};
+  pool_.run([&](int) {
+    for (std::size_t block; (block = next.fetch_add(1)) < view->block_sizes.size();) {
+      const std::size_t begin = block * kBlock, end = begin + view->block_sizes[block];
+      for (std::size_t splat = begin; splat < end; ++splat) summed_gradient(*view, splat, parts);
+      kernels_.update(view->splats.data(), view->ids.data(), view->gradients.data(), begin, end, camera, pose, gaussians,
+                      adam, rates, bounds ? bounds + kBounds * block : nullptr);
+    }
+  });
+  double loss = 0.0;
+  for (double part : losses) loss += part;
+  return loss;
 }
 
 }  // namespace splatam

@@ -9,6 +9,8 @@
 #endif
 namespace splatam {
 namespace avx2 {
+#include "lanes.inl"
+#include "align.inl"
 #include "kernels.inl"
 }
 }  // namespace splatam
@@ -20,7 +22,7 @@ namespace avx2 {
 
 namespace splatam {
 const Kernels& kernels_avx2() {
-  static const Kernels kernels{avx2::project, avx2::forward, avx2::backward, "avx2"};
+  static const Kernels kernels = avx2::table("avx2");
   return kernels;
 }
 }  // namespace splatam

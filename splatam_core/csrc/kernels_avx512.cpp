@@ -9,6 +9,8 @@
 #endif
 namespace splatam {
 namespace avx512 {
+#include "lanes.inl"
+#include "align.inl"
 #include "kernels.inl"
 }
 }  // namespace splatam
@@ -20,7 +22,7 @@ namespace avx512 {
 
 namespace splatam {
 const Kernels& kernels_avx512() {
-  static const Kernels kernels{avx512::project, avx512::forward, avx512::backward, "avx512"};
+  static const Kernels kernels = avx512::table("avx512");
   return kernels;
 }
 }  // namespace splatam

@@ -2,10 +2,12 @@
 
 namespace splatam {
 namespace generic {
+#include "lanes.inl"
+#include "align.inl"
 #include "kernels.inl"
 }
 const Kernels& kernels_generic() {
-  static const Kernels kernels{generic::project, generic::forward, generic::backward, "generic"};
+  static const Kernels kernels = generic::table("generic");
   return kernels;
 }
 }  // namespace splatam

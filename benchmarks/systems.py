@@ -1,0 +1,227 @@
+"""Whole systems side by side on one recording: our presets, Open3D's dense SLAM, OpenCV's RGB-D odometry.
+
+    python benchmarks/systems.py SOURCE [--width 320] [--runs 5] [--systems realtime,quick,open3d,opencv] [--plot FILE.png]
+
+Every run is a process of its own, one after the other, the systems taking turns; frames are decoded before the clock
+starts. A system is a preset, ``open3d`` (``pip install open3d``; voxel-block grid, 3.0/512 m voxels, frame to model) or
+``opencv`` (frame to frame, no map). ``NAME:60`` runs on the first 60 frames, ``NAME*1`` once instead of --runs times;
+``NAME[key=value;...]`` changes settings of a preset.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+from header import print_header
+from numpy.typing import NDArray
+
+from splatam_core import environment
+from splatam_core.config import apply_threads, load_config
+from splatam_core.datasets.registry import open_sequence
+from splatam_core.evaluation.images import ViewScorer, mean_scores
+from splatam_core.evaluation.trajectory import trajectory_error
+from splatam_core.rasterizer import make_rasterizer
+from splatam_core.slam import Slam
+from splatam_core.types import RgbdFrame, StageTimings, Trajectory
+
+Poses = list[NDArray[np.float64] | None]
+SCORED_EVERY = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Of one run."""
+
+    frames: int
+    tracked: int
+    seconds: float
+    ate_cm: float | None
+    psnr_db: float | None
+    num_gaussians: int | None
+    peak_rss_mb: float | None
+    median_stages_ms: dict[str, float]
+
+
+def run_ours(frames: Sequence[RgbdFrame], preset: str, overrides: list[str]) -> tuple[Poses, float, Slam, list[StageTimings]]:
+    """A preset, frame by frame."""
+    config = load_config(preset, overrides)
+    apply_threads(config)
+    slam = Slam(config)
+    begin = time.perf_counter()
+    results = [slam.process(frame) for frame in frames]
+    return [result.T_world_cam for result in results], time.perf_counter() - begin, slam, [r.timings for r in results]
+
+
+def run_open3d(frames: Sequence[RgbdFrame]) -> tuple[Poses, float]:
+    """Dense SLAM as in Open3D's own example."""
+    import open3d as o3d
+
+    camera, device = frames[0].camera, o3d.core.Device('CPU:0')
+    intrinsic = o3d.core.Tensor(camera.matrix)
+    T_world_cam = o3d.core.Tensor(np.eye(4))
+    model = o3d.t.pipelines.slam.Model(3.0 / 512, 16, 10000, T_world_cam, device)
+    height, width = frames[0].depth_m.shape
+    live = o3d.t.pipelines.slam.Frame(height, width, intrinsic, device)
+    rendered = o3d.t.pipelines.slam.Frame(height, width, intrinsic, device)
+    poses: Poses = []
+    begin = time.perf_counter()
+    for index, frame in enumerate(frames):
+        live.set_data_from_image('depth', o3d.t.geometry.Image(o3d.core.Tensor(np.rint(1000 * frame.depth_m).astype(np.uint16)[..., None])))
+        live.set_data_from_image('color', o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(frame.rgb))))
+        if index > 0:
+            tracked = model.track_frame_to_model(live, rendered, 1000.0, 4.0, 0.07)
+            T_world_cam = T_world_cam @ tracked.transformation
+        poses.append(T_world_cam.numpy().copy())
+        model.update_frame_pose(index, T_world_cam)
+        model.integrate(live, 1000.0, 4.0, 8.0)
+        model.synthesize_model_frame(rendered, 1000.0, 0.1, 4.0, 8.0, False)
+    return poses, time.perf_counter() - begin
+
+
+def run_opencv(frames: Sequence[RgbdFrame]) -> tuple[Poses, float]:
+    """RGB-D odometry between consecutive frames."""
+    settings = cv2.OdometrySettings()
+    settings.setCameraMatrix(frames[0].camera.matrix.astype(np.float32))
+    odometry = cv2.Odometry(cv2.OdometryType_RGB_DEPTH, settings, cv2.OdometryAlgoType_COMMON)
+    T_world_cam, last, poses = np.eye(4), None, []
+    begin = time.perf_counter()
+    for frame in frames:
+        depth = np.where(frame.depth_m > 0, frame.depth_m, np.float32(np.nan))
+        pair = depth, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        if last is not None:
+            found, motion = odometry.compute(last[0], last[1], pair[0], pair[1])
+            if found:
+                T_world_cam = T_world_cam @ np.linalg.inv(motion)
+        poses.append(T_world_cam.copy())
+        last = pair
+    return poses, time.perf_counter() - begin
+
+
+def run_one(system: SimpleNamespace, source: str, width: int) -> Outcome:
+    """One system, in this process."""
+    sequence = open_sequence(source, width=width, max_frames=system.frames)
+    frames = [sequence[index] for index in range(len(sequence))]
+    slam, stages = None, []
+    if system.name == 'open3d':
+        poses, seconds = run_open3d(frames)
+    elif system.name == 'opencv':
+        poses, seconds = run_opencv(frames)
+    else:
+        poses, seconds, slam, stages = run_ours(frames, system.name, system.overrides)
+    peak = environment.peak_rss_mb()
+    tracked = [(frame, pose) for frame, pose in zip(frames, poses) if pose is not None]
+    estimate = Trajectory(np.array([f.stamp_ns for f, _ in tracked]), np.array([pose for _, pose in tracked]))
+    truth = sequence.ground_truth()
+    psnr_db = None
+    if slam is not None:
+        scorer = ViewScorer(slam.map.gaussians, make_rasterizer(slam.config.rasterizer, slam.config.threads), slam.config.depth)
+        psnr_db = mean_scores(scorer.score(*pair) for pair in tracked[::SCORED_EVERY]).psnr_db
+    return Outcome(
+        len(frames), len(tracked), seconds, None if truth is None else 100 * trajectory_error(estimate, truth).rmse_m,
+        psnr_db, slam and slam.num_gaussians, peak,
+        {name: statistics.median(getattr(s, name) for s in stages) for name in StageTimings.__slots__} if stages else {},
+    )  # fmt: skip
+
+
+def parsed(text: str, runs: int) -> SimpleNamespace:
+    """``NAME[settings]:frames*runs``."""
+    match = re.fullmatch(r'(?P<name>[^\[:*]+)(\[(?P<set>[^\]]*)\])?(:(?P<frames>\d+))?(\*(?P<runs>\d+))?', text)
+    if match is None:
+        raise SystemExit(f"'{text}': expected NAME, NAME:FRAMES, NAME*RUNS or NAME[key=value;...]")
+    overrides = [entry for entry in (match['set'] or '').split(';') if entry]
+    frames = int(match['frames']) if match['frames'] else None
+    return SimpleNamespace(text=text, name=match['name'], overrides=overrides, frames=frames, runs=int(match['runs'] or runs))
+
+
+def in_a_process(system: SimpleNamespace, args: argparse.Namespace) -> Outcome:
+    """The same, in a fresh process: memory and threads of one run are nothing to the next."""
+    command = [sys.executable, __file__, args.source, '--width', str(args.width), '--systems', system.text, '--one']
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    return Outcome(**json.loads(done.stdout.splitlines()[-1]))
+
+
+def row(system: SimpleNamespace, outcomes: list[Outcome], fastest_peer: float | None) -> str:
+    """Medians and spread."""
+    fps = sorted(o.frames / o.seconds for o in outcomes)
+
+    def median(name: str, form: str) -> str:
+        known = [getattr(o, name) for o in outcomes if getattr(o, name) is not None]
+        return form.format(statistics.median(known)) if known else '–'
+
+    ratio = '' if fastest_peer is None else f'{statistics.median(fps) / fastest_peer:.2f}'
+    cells = [
+        f'`{system.text}`', str(len(outcomes)), f'{outcomes[0].tracked}/{outcomes[0].frames}',
+        f'{statistics.median(fps):.2f} ({fps[0]:.2f}–{fps[-1]:.2f})', ratio, median('ate_cm', '{:.2f}'),
+        median('psnr_db', '{:.2f}'), median('num_gaussians', '{:.0f}'), median('peak_rss_mb', '{:.0f}'),
+    ]  # fmt: skip
+    return '| ' + ' | '.join(cells) + ' |'
+
+
+def plot(path: Path, systems: list[SimpleNamespace], outcomes: dict[str, list[Outcome]], title: str) -> None:
+    """Frames per second against trajectory error."""
+    import matplotlib
+
+    matplotlib.use('Agg')
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(6, 4), layout='constrained')
+    for system in systems:
+        done = outcomes[system.text]
+        x, y = (statistics.median(values) for values in ([o.frames / o.seconds for o in done], [o.ate_cm for o in done]))
+        axes.plot(x, y, 'o')
+        axes.annotate(system.text, (x, y), xytext=(5, 4), textcoords='offset points')
+    axes.set(xscale='log', xlabel='frames per second', ylabel='ATE RMSE, cm', title=title, ylim=(0, None))
+    axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=120)
+
+
+def main() -> None:
+    """Run all in turns and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('source')
+    parser.add_argument('--width', type=int, default=320)
+    parser.add_argument('--runs', type=int, default=5)
+    parser.add_argument('--systems', default='realtime,quick,opencv')
+    parser.add_argument('--plot', type=Path)
+    parser.add_argument('--one', action='store_true', help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    systems = [parsed(text, args.runs) for text in args.systems.split(',')]
+    if args.one:
+        print(json.dumps(asdict(run_one(systems[0], args.source, args.width))))
+        return
+    name = f'{Path(args.source).name}, width {args.width}'
+    print_header(f'Systems on {name}', args.runs)
+    outcomes: dict[str, list[Outcome]] = {system.text: [] for system in systems}
+    for turn in range(max(system.runs for system in systems)):
+        for system in systems:
+            if turn < system.runs:
+                outcomes[system.text].append(in_a_process(system, args))
+    peer = outcomes.get('open3d')
+    peer_fps = statistics.median(o.frames / o.seconds for o in peer) if peer else None
+    print('| system | runs | tracked | fps (min–max) | x Open3D | ATE RMSE cm | PSNR dB | Gaussians | peak MB |')
+    print('|' + '---|' * 9)
+    for system in systems:
+        print(row(system, outcomes[system.text], peer_fps))
+    for system in systems:
+        stages = outcomes[system.text][0].median_stages_ms
+        if stages:
+            print(f'\n`{system.text}`, median ms of a frame: ' + ', '.join(f'{k} {v:.1f}' for k, v in stages.items()) + '.')
+    print(f'\nPSNR over every {SCORED_EVERY}th frame, final map, estimated poses, pixels with depth.')
+    if args.plot:
+        plot(args.plot, systems, outcomes, name)
+
+
+if __name__ == '__main__':
+    main()

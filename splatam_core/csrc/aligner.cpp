@@ -1,0 +1,99 @@
+#include "aligner.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <limits>
+
+namespace splatam {
+namespace {
+
+constexpr float kNone = std::numeric_limits<float>::quiet_NaN();
+
+// The upper edge of the bin that holds the median; see tally() for the bins.
+float median(const std::uint32_t* bins) {
+  std::uint64_t total = 0, below = 0;
+  for (int bin = 0; bin < kResidualBins; ++bin) total += bins[bin];
+  if (total == 0) return kNone;
+  int bin = 0;
+  while (2 * (below + bins[bin]) < total) below += bins[bin++];
+  const std::uint32_t bits = std::uint32_t(bin + 1 + ((127 - 64) << 3)) << 20;
+  float edge;
+  std::memcpy(&edge, &bits, sizeof edge);
+  return edge;
+}
+
+void add(AlignmentSums& total, const AlignmentSums& part) {
+  for (int i = 0; i < kUnknowns * (kUnknowns + 1) / 2; ++i) total.H[i] += part.H[i];
+  for (int i = 0; i < kUnknowns; ++i) total.g[i] += part.g[i];
+  total.cost += part.cost;
+  total.points += part.points, total.compared += part.compared;
+  total.seen += part.seen, total.agreeing += part.agreeing;
+}
+
+}  // namespace
+
+template <typename Task>
+void Aligner::for_rows(int rows, Task&& task) {
+  const int parts = pool_.size();
+  pool_.run([&](int thread) { task(thread, rows * thread / parts, rows * (thread + 1) / parts); });
+}
+
+Aligner::Result Aligner::linearize(const float* brightness, const float* depth, const Camera& camera,
+                                   const float* layers, const Pose& motion, const AlignmentSettings& settings) {
+  std::vector<AlignmentSums> sums(pool_.size());
+  std::vector<ResidualHistogram> histograms(pool_.size());
+  for_rows(camera.height, [&](int thread, int begin, int end) {
+    kernels_.align(brightness, depth, camera, begin, end, layers, motion, settings, sums[thread], histograms[thread]);
+  });
+  for (int thread = 1; thread < pool_.size(); ++thread) {
+    add(sums[0], sums[thread]);
+    for (int bin = 0; bin < kResidualBins; ++bin) {
+      histograms[0].light[bin] += histograms[thread].light[bin];
+      histograms[0].depth[bin] += histograms[thread].depth[bin];
+    }
+  }
+  return {sums[0], median(histograms[0].light), median(histograms[0].depth)};
+}
+
+void Aligner::halve(const float* brightness, const float* depth, int width, int height, float max_step,
+                    float* half_brightness, float* half_depth) {
+  const int columns = width / 2;
+  for_rows(height / 2, [&](int, int begin, int end) {
+    for (int y = begin; y < end; ++y)
+      for (int x = 0; x < columns; ++x) {
+        const std::size_t a = std::size_t(2 * y) * width + 2 * x, b = a + width;
+        const float z[4] = {depth[a], depth[a + 1], depth[b], depth[b + 1]};
+        const float mean = 0.25f * (z[0] + z[1] + z[2] + z[3]);  // NaN if any is
+        const float nearest = std::min(std::min(z[0], z[1]), std::min(z[2], z[3]));
+        const float farthest = std::max(std::max(z[0], z[1]), std::max(z[2], z[3]));
+        half_brightness[y * columns + x] =
+            0.25f * (brightness[a] + brightness[a + 1] + brightness[b] + brightness[b + 1]);
+        half_depth[y * columns + x] = farthest - nearest <= max_step * mean ? mean : kNone;
+      }
+  });
+}
+
+void Aligner::layers(const float* brightness, const float* depth, int width, int height, float max_step,
+                     float* layers) {
+  for_rows(height, [&](int, int begin, int end) {
+    for (int y = begin; y < end; ++y)
+      for (int x = 0; x < width; ++x) {
+        const std::size_t at = std::size_t(y) * width + x;
+        const std::size_t left = x > 0 ? at - 1 : at, right = x + 1 < width ? at + 1 : at;
+        const std::size_t above = y > 0 ? at - width : at, below = y + 1 < height ? at + width : at;
+        const bool inner = right - left == 2 && below - above == 2 * std::size_t(width);
+        float* out = layers + at * kLayers;
+        out[0] = brightness[at];
+        out[1] = inner ? 0.5f * (brightness[right] - brightness[left]) : 0.0f;
+        out[2] = inner ? 0.5f * (brightness[below] - brightness[above]) : 0.0f;
+        out[4] = inner ? 0.5f * (depth[right] - depth[left]) : 0.0f;
+        out[5] = inner ? 0.5f * (depth[below] - depth[above]) : 0.0f;
+        const float limit = max_step * depth[at];
+        out[3] = std::fabs(out[4]) <= limit && std::fabs(out[5]) <= limit ? depth[at] : kNone;
+        out[6] = out[7] = 0.0f;
+      }
+  });
+}
+
+}  // namespace splatam

@@ -1,0 +1,164 @@
+// The inner loops, compiled once per instruction set and chosen at run time.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+namespace splatam {
+
+constexpr int kTile = 8;           // pixels on a side
+constexpr float kNear = 0.2f;      // metres
+constexpr float kBlur = 0.3f;      // px^2
+constexpr float kMaxAlpha = 0.99f;
+constexpr float kMinAlpha = 1.0f / 255.0f;
+constexpr float kMinTransmittance = 1e-4f;
+
+struct Camera {
+  int width, height;
+  float fx, fy, cx, cy;
+  float focal() const { return 0.5f * (fx + fy); }
+};
+
+struct Pose {  // world to camera
+  float R[9], t[3];
+};
+
+// A Gaussian on the image. alpha(d) = opacity exp(falloff d^2).
+struct Splat {
+  float u, v, falloff, opacity, r, g, b, z;
+};
+
+// The tiles that a splat's disc touches: columns x0..x1, rows y0..y1, less the corners (top left, top right, bottom
+// left, bottom right: bits 0 to 3) that the disc misses.
+struct TileRect {
+  std::uint16_t x0, y0, x1, y1 : 12, missed_corners : 4;
+};
+constexpr int kMaxTiles = 1 << 12;  // per side
+
+// Sums over pixels of dL/d(log alpha) times 1, dx, dy, d^2, and of dL/d(r, g, b, z).
+struct SplatGradient {
+  float log_alpha, dx, dy, squared, r, g, b, z;
+};
+
+struct GaussianArrays {
+  const float *means, *log_scales, *logit_opacities, *rgb;
+};
+
+struct Images {  // planar, width * height each; rgb three planes
+  float *rgb, *depth, *silhouette;
+};
+
+struct ConstImages {
+  const float *rgb, *depth, *silhouette;
+};
+
+struct MutableGaussians {
+  float *means, *log_scales, *logit_opacities, *rgb;
+};
+
+// What a view should look like, and how much a difference weighs, per pixel and channel.
+struct Target {
+  const std::uint8_t* rgb;  // [H, W, 3]
+  const float* depth;       // [H, W] metres, 0 = no reading
+  float color_weight, depth_weight;
+};
+
+// Adam (Kingma and Ba 2015). A Gaussian's values in this order: mean, log scale, logit opacity, rgb.
+struct AdamState {
+  float* moments;        // [N, 16]: first moments, then second
+  std::uint8_t* steps;   // [N], counts to 255
+};
+
+struct AdamRates {
+  float means, log_scales, logit_opacities, rgb;
+};
+
+constexpr int kFloatsPerPrint = 32;  // what a splat is to one tile, see kernels.inl
+
+struct TileList {
+  int x, y;  // pixel of its upper left corner
+  const std::uint32_t* splats;
+  std::size_t count;
+};
+
+// One picture of an alignment: brightness, its slopes along u and v, depth in metres, its slopes; then two of padding,
+// so that a pixel is a vector. NaN in the depth marks what is no surface.
+constexpr int kLayers = 8;
+
+// The linearised residuals of an alignment, sum by sum. Unknowns: six of the twist, then the light's gain and bias.
+constexpr int kUnknowns = 8;
+struct AlignmentSums {
+  double H[kUnknowns * (kUnknowns + 1) / 2];  // upper triangle, row by row
+  double g[kUnknowns];
+  double cost;             // of the seen points, each below one per kind of residual
+  // Points with depth; of those, the ones that fall on depth in the frame; on the same surface; with residuals that agree.
+  std::int64_t points, compared, seen, agreeing;
+};
+
+struct AlignmentSettings {
+  float gain, bias;                     // of the light: frame = gain * reference + bias
+  float light_scale, depth_scale;       // of the residuals; that of depth is relative
+  float max_depth_ratio;                // larger differences are other surfaces
+  float inlier_light, inlier_depth;     // what counts as agreeing
+};
+
+// Residuals by magnitude, in bins of an eighth of an octave: their median is wanted, not their order.
+constexpr int kResidualBins = 1024;
+struct ResidualHistogram {
+  std::uint32_t light[kResidualBins], depth[kResidualBins];
+};
+
+// A splat's gradient, back through its projection.
+struct GaussianGradient {
+  float camera[3];  // of the centre, in camera coordinates
+  float log_scale, logit_opacity;
+};
+
+static inline GaussianGradient through_projection(const Splat& s, const SplatGradient& g, const Camera& camera) {
+  const float inverse_z = 1.0f / s.z;
+  const float inverse_variance = -2.0f * s.falloff, variance = 1.0f / inverse_variance;
+  const float du = g.dx * inverse_variance, dv = g.dy * inverse_variance;  // dx is pixel minus centre
+  const float dvariance = 0.5f * g.squared * inverse_variance * inverse_variance;
+  const float spread = 2.0f * (variance - kBlur);  // d variance / d log scale
+  const float x_over_z = (s.u - camera.cx) / camera.fx, y_over_z = (s.v - camera.cy) / camera.fy;
+  const float dx = du * camera.fx * inverse_z, dy = dv * camera.fy * inverse_z;
+  const float dz = g.z - dx * x_over_z - dy * y_over_z - dvariance * spread * inverse_z;
+  return {{dx, dy, dz}, dvariance * spread, g.log_alpha * (1.0f - s.opacity)};
+}
+
+struct Kernels {
+  // Projects Gaussians [begin, end); writes the visible ones to splats, rects and ids, from `begin` on.
+  // Returns how many are visible.
+  std::size_t (*project)(const GaussianArrays&, const Camera&, const Pose&, std::size_t begin, std::size_t end,
+                         Splat* splats, TileRect* rects, std::uint32_t* ids);
+  void (*forward)(const TileList&, const Splat*, const Camera&, const Images&);
+  // Adds to gradients. Without `map`, the colour gradients stay as they are.
+  void (*backward)(const TileList&, const Splat*, const Camera&, const ConstImages& drawn, const ConstImages& gradient,
+                   bool map, SplatGradient* gradients);
+  // Blends a tile, compares it to the target (L1) and adds the gradients in one go. Returns the tile's loss.
+  // `prints` is scratch of kFloatsPerPrint for each splat of the list.
+  double (*fit)(const TileList&, const Splat* splats, const Camera&, const Target&, float* prints,
+                SplatGradient* gradients);
+
+  // Adam steps of Gaussians ids[i], i in [begin, end), whose splats have gradients; bounds (of their block) grow along.
+  void (*update)(const Splat* splats, const std::uint32_t* ids, const SplatGradient* gradients, std::size_t begin,
+                 std::size_t end, const Camera&, const Pose&, const MutableGaussians&, const AdamState&,
+                 const AdamRates&, float* bounds);
+
+  // Rows [begin, end) of a reference [H, W] against a frame's layers: how the camera should move, and what agrees.
+  void (*align)(const float* brightness, const float* depth, const Camera&, int begin, int end, const float* layers,
+                const Pose& motion, const AlignmentSettings&, AlignmentSums&, ResidualHistogram&);
+
+  const char* name;
+};
+
+const Kernels& kernels_generic();
+#if defined(__x86_64__)
+const Kernels& kernels_avx2();
+const Kernels& kernels_avx512();
+#endif
+
+// The fastest that this processor runs; SPLATAM_ISA=generic|avx2|avx512 lowers the choice.
+const Kernels& best_kernels();
+
+}  // namespace splatam
