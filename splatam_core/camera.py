@@ -26,6 +26,8 @@ DISTORTION_COEFFICIENTS = {
     'equidistant': (4,),
 }
 
+POSE_AXES = ('opencv', 'opengl')
+
 
 @dataclass(frozen=True, slots=True)
 class PinholeCamera:
@@ -52,9 +54,9 @@ class PinholeCamera:
         """The intrinsic matrix K, [3, 3]."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
-    def cropped(self, width: int, height: int) -> PinholeCamera:
-        """The camera of the image's upper left corner."""
-        return PinholeCamera(width, height, self.fx, self.fy, self.cx, self.cy)
+    def cropped(self, width: int, height: int, left: int = 0, top: int = 0) -> PinholeCamera:
+        """The camera of a part of the image."""
+        return PinholeCamera(width, height, self.fx, self.fy, self.cx - left, self.cy - top)
 
     def resized(self, width: int, height: int) -> PinholeCamera:
         """The camera of the same image resampled to another size."""
@@ -117,14 +119,17 @@ class CameraFile:
     Attributes:
         calibration: the camera.
         depth_scale: stored depth counts per metre; None where the file does not say.
+        pose_axes: axes of the camera in pose files: ``opencv`` (x right, y down, z forward) or ``opengl``
+            (x right, y up, z backward); None where the file does not say.
     """
 
     calibration: CameraCalibration
     depth_scale: float | None
+    pose_axes: str | None = None
 
 
 def read_camera_file(path: Path) -> CameraFile:
-    """Read ``width height fx fy cx cy distortion_model distortion depth_scale`` from a YAML file.
+    """Read ``width height fx fy cx cy distortion_model distortion depth_scale pose_axes`` from a YAML file.
 
     Raises:
         CameraError: the file is no such mapping, or a key is missing, unknown or not a number.
@@ -136,7 +141,7 @@ def read_camera_file(path: Path) -> CameraFile:
     if not isinstance(values, dict):
         raise CameraError(f'{path}: expected a mapping with width, height, fx, fy, cx, cy')
     required = {'width', 'height', 'fx', 'fy', 'cx', 'cy'}
-    optional = {'distortion_model', 'distortion', 'depth_scale'}
+    optional = {'distortion_model', 'distortion', 'depth_scale', 'pose_axes'}
     if missing := required - values.keys():
         raise CameraError(f'{path}: missing {", ".join(sorted(missing))}')
     if unknown := values.keys() - required - optional:
@@ -157,8 +162,11 @@ def _camera_file(values: dict[str, Any]) -> CameraFile:
     scale = values.get('depth_scale')
     if scale is not None and not float(scale) > 0:
         raise CameraError(f'depth_scale {scale} must be positive (counts per metre)')
+    axes = values.get('pose_axes')
+    if axes not in (None, *POSE_AXES):
+        raise CameraError(f"pose_axes '{axes}' is not one of {', '.join(POSE_AXES)}")
     model = values.get('distortion_model') or 'none'
-    return CameraFile(CameraCalibration(pinhole, model, distortion), None if scale is None else float(scale))
+    return CameraFile(CameraCalibration(pinhole, model, distortion), None if scale is None else float(scale), axes)
 
 
 @dataclass(frozen=True)
@@ -171,10 +179,16 @@ class FrameFactory:
     Attributes:
         calibration: the camera that took the images.
         width: width of the frames in pixels; None keeps the recorded size. Height follows the aspect.
+        depth_camera: the ideal camera of the depth images where it is not colour's. It has the same centre
+            and axes, so that depth only moves to other pixels.
+        rectified: the ideal camera to rectify to, in the recorded size, where it is not the calibration's
+            own: frames whose cameras differ a little come out as frames of one.
     """
 
     calibration: CameraCalibration
     width: int | None = None
+    depth_camera: PinholeCamera | None = None
+    rectified: PinholeCamera | None = None
 
     def __post_init__(self) -> None:
         if self.width is not None and self.width < 16:
@@ -183,25 +197,42 @@ class FrameFactory:
     @cached_property
     def camera(self) -> PinholeCamera:
         """The ideal camera of every frame made here."""
-        pinhole = self.calibration.pinhole
+        pinhole = self._pinhole
         if self.width is None or self.width == pinhole.width:
             return pinhole
         return pinhole.resized(self.width, max(1, round(pinhole.height * self.width / pinhole.width)))
 
+    @property
+    def _pinhole(self) -> PinholeCamera:
+        return self.rectified or self.calibration.pinhole
+
     @cached_property
     def _maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        if not self.calibration.is_distorted:
+        """Where in a recorded image each rectified pixel lies: x and y, [H, W] each."""
+        calibration, pinhole = self.calibration, self._pinhole
+        if not calibration.is_distorted and pinhole == calibration.pinhole:
             return None
-        pinhole = self.calibration.pinhole
         undistort = (
             cv2.fisheye.initUndistortRectifyMap
-            if self.calibration.distortion_model == 'equidistant'
+            if calibration.distortion_model == 'equidistant'
             else cv2.initUndistortRectifyMap
         )
+        distortion = np.array(calibration.distortion if calibration.is_distorted else [0.0] * 4)
         return undistort(
-            pinhole.matrix, np.array(self.calibration.distortion), np.eye(3), pinhole.matrix,
+            calibration.pinhole.matrix, distortion, np.eye(3), pinhole.matrix,
             (pinhole.width, pinhole.height), cv2.CV_32FC1,
         )  # fmt: skip
+
+    @cached_property
+    def _depth_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """The same for depth images."""
+        if self.depth_camera is None:
+            return self._maps
+        to, of = self._pinhole, self.depth_camera
+        x = (np.arange(to.width) - to.cx) / to.fx * of.fx + of.cx
+        y = (np.arange(to.height) - to.cy) / to.fy * of.fy + of.cy
+        x, y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
+        return x, y
 
     def make(self, stamp_ns: int, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> RgbdFrame:
         """Make one frame.
@@ -209,29 +240,63 @@ class FrameFactory:
         Args:
             stamp_ns: time of the exposure.
             rgb: [H, W, 3] in the recorded size.
-            depth_m: [H, W] metres, registered to colour; 0, NaN and inf are no reading.
+            depth_m: metres, registered to colour; another resolution of the same view will do. 0, NaN and inf are no
+                reading. [H, W], or the size of ``depth_camera`` where there is one.
 
         Raises:
-            FrameError: an image has another size than the calibration.
+            FrameError: colour has another size than the calibration, or depth another shape.
         """
         pinhole = self.calibration.pinhole
-        expected = (pinhole.height, pinhole.width)
-        for name, image in (('colour', rgb), ('depth', depth_m)):
-            if image.shape[:2] != expected:
-                raise FrameError(
-                    f'{name} image is {image.shape[1]}x{image.shape[0]} but the camera is calibrated for '
-                    f'{pinhole.width}x{pinhole.height}; colour, depth and camera must be registered to each other'
-                )
+        if rgb.shape[:2] != (pinhole.height, pinhole.width):
+            raise FrameError(
+                f'colour image is {_size(rgb)} but the camera is calibrated for {pinhole.width}x{pinhole.height}; '
+                'is the camera info that of this image?'
+            )
+        if self.depth_camera is None:
+            depth_m = self._at_colour_size(depth_m)
+        else:
+            _check_depth_size(depth_m, self.depth_camera)
         if self._maps is not None:
             rgb = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR)
-            depth_m = cv2.remap(depth_m, *self._maps, cv2.INTER_NEAREST)
+        if self._depth_maps is not None:
+            depth_m = cv2.remap(depth_m, *self._depth_maps, cv2.INTER_NEAREST)
         size = (self.camera.width, self.camera.height)
-        if size != (pinhole.width, pinhole.height):
-            shrinking = size[0] < pinhole.width
+        if size != (self._pinhole.width, self._pinhole.height):
+            shrinking = size[0] < self._pinhole.width
             rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)
             depth_m = _resize_nearest(depth_m, size)
-        depth_m = np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(0)).astype(np.float32)
+        depth_m = kept(depth_m, (depth_m > 0) & (depth_m < np.inf))
         return RgbdFrame(stamp_ns, np.ascontiguousarray(rgb), depth_m, self.camera)
+
+    def _at_colour_size(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        width, height = self.calibration.pinhole.width, self.calibration.pinhole.height
+        if depth_m.shape == (height, width):
+            return depth_m
+        if abs(depth_m.shape[0] - height * depth_m.shape[1] / width) >= 1:  # a row: halving an odd size rounds
+            raise FrameError(
+                f'depth image is {_size(depth_m)}, which is no other resolution of a {width}x{height} colour image, so '
+                'it is not registered to it; use the depth that the driver aligns to colour, with RealSense '
+                'aligned_depth_to_color, with Azure Kinect depth_to_rgb'
+            )
+        return _resize_nearest(depth_m, (width, height))
+
+
+def _size(image: NDArray[Any]) -> str:
+    return f'{image.shape[1]}x{image.shape[0]}'
+
+
+def _check_depth_size(depth_m: NDArray[np.float32], camera: PinholeCamera) -> None:
+    if depth_m.shape != (camera.height, camera.width):
+        raise FrameError(
+            f'depth image is {_size(depth_m)} but its camera is calibrated for {camera.width}x{camera.height}'
+        )
+
+
+def kept(depth_m: NDArray[np.floating[Any]], chosen: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """[H, W] the readings that are chosen, 0 elsewhere; three times as fast as ``np.where``."""
+    readings = np.zeros(depth_m.shape, np.float32)
+    np.copyto(readings, depth_m, where=chosen, casting='same_kind')
+    return readings
 
 
 def _resize_nearest(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
-BAG_SUFFIXES = ('.db3', '.mcap')
+BAG_SUFFIXES = ('.db3', '.mcap', '.bag')
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,12 +268,16 @@ def convert(args: argparse.Namespace) -> int:
 
 def _add_source_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        'source', metavar='SOURCE', help='dataset folder, rosbag2 (folder, .db3, .mcap) or synthetic[:seed=0,...]'
+        'source', metavar='SOURCE', help='dataset folder, bag (folder, .db3, .mcap, ROS 1 .bag), synthetic[:seed=0,...]'
     )
     parser.add_argument('--format', metavar='F', help='reader to use (default: guessed from SOURCE)')
     parser.add_argument('--start', type=int, default=0, metavar='N', help='leave out the first N frames')
     parser.add_argument('--max-frames', type=_positive, metavar='N', help='read at most N frames')
+    parser.add_argument('--stride', type=_positive, default=1, metavar='N', help='read every n-th frame only')
     parser.add_argument('--width', type=_positive, metavar='W', help='resize the frames to W pixels across')
+    parser.add_argument('--crop', type=int, default=0, metavar='P', help='cut P pixels off each edge, after resizing')
+    parser.add_argument('--split', choices=('train', 'test'), help='of Replica-V2 and ScanNet++ (default: train)')
+    parser.add_argument('--skip-bad', action='store_true', help='leave out what ScanNet++ flags as bad')
     for topic, what in (('rgb', 'colour'), ('depth', 'depth'), ('info', 'camera info')):
         parser.add_argument(f'--{topic}', metavar='TOPIC', help=f'{what} topic of a bag (default: found by type)')
 
@@ -282,7 +286,10 @@ def _source(args: argparse.Namespace) -> Source:
     from splatam_core.run_folder import Source
 
     path = str(Path(args.source).resolve()) if Path(args.source).exists() else args.source
-    return Source(path, args.format, args.start, args.max_frames, args.width, args.rgb, args.depth, args.info)
+    return Source(
+        path, args.format, args.start, args.max_frames, args.width, args.rgb, args.depth, args.info,
+        args.stride, args.crop, args.split, args.skip_bad,
+    )  # fmt: skip
 
 
 def _open(source: Source) -> FrameSequence:
@@ -296,6 +303,10 @@ def _open(source: Source) -> FrameSequence:
         start=source.start,
         max_frames=source.max_frames,
         topics=BagTopics(source.rgb, source.depth, source.info),
+        stride=source.stride,
+        crop=source.crop,
+        split=source.split,
+        skip_bad=source.skip_bad,
     )
 
 

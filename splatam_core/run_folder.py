@@ -9,12 +9,14 @@
     config.yaml      every setting
     run.json         source, camera, commit, machine, versions
     report.png       drawn by the evaluation
+    previous/        the same of before the map was last reset
 """
 
 from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -45,6 +47,7 @@ RUN = 'run.json'
 REPORT = 'report.png'
 FILES = (TRAJECTORY, FRAMES, MAP, METRICS, CONFIG, RUN, REPORT)
 CHECKPOINTS = 'checkpoints'
+PREVIOUS = 'previous'
 LOST = '# lost '
 
 
@@ -61,6 +64,10 @@ class Source:
         rgb: colour topic of a bag; None = found by type.
         depth: depth topic.
         info: camera info topic.
+        stride: every how manieth frame was read.
+        crop: pixels cut off each edge of the frames.
+        split: train or test, of a dataset that comes so.
+        skip_bad: whether frames that the dataset flags as bad were left out.
     """
 
     path: str
@@ -71,6 +78,10 @@ class Source:
     rgb: str | None = None
     depth: str | None = None
     info: str | None = None
+    stride: int = 1
+    crop: int = 0
+    split: str | None = None
+    skip_bad: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,11 +134,10 @@ class RunFolder:
     Use as a context manager, or call ``close``. Not for several threads at once.
     """
 
-    def __init__(self, path: Path, trajectory: TextIO, frames: TextIO) -> None:
+    def __init__(self, path: Path, records: Sequence[FrameRecord] = ()) -> None:
         self.path = path
-        self._trajectory = trajectory
-        self._frames = frames
-        self._records: list[FrameRecord] = []
+        self._records = list(records)
+        self._trajectory, self._frames = ((path / name).open('a', newline='\n') for name in (TRAJECTORY, FRAMES))
 
     @classmethod
     def create(
@@ -147,16 +157,65 @@ class RunFolder:
         try:
             if path.is_dir() and any(path.iterdir()) and overwrite:
                 _remove_run(path)
-            elif path.exists() and not (path.is_dir() and not any(path.iterdir())):
-                raise RunFolderError(f'{path} exists: choose another folder{_overwrite_hint(path)}')
+            check_is_free(path)
             path.mkdir(parents=True, exist_ok=True)
-            (path / CONFIG).write_text(to_yaml(config))
-            replace_text(path / RUN, _to_json(_run_information(description)))
-            trajectory, frames = ((path / name).open('x', newline='\n') for name in (TRAJECTORY, FRAMES))
+            return cls._begin(path, config, _run_information(description))
         except OSError as error:
             raise RunFolderError(f'{path}: cannot be written: {error.strerror}; choose another folder') from None
-        _write_csv_row(frames, _CSV_HEADER)
-        return cls(path, trajectory, frames)
+
+    @classmethod
+    def _begin(cls, path: Path, config: SlamConfig, information: dict[str, Any]) -> RunFolder:
+        replace_text(path / CONFIG, to_yaml(config))
+        replace_text(path / RUN, _to_json(information))
+        folder = cls(path)
+        _write_csv_row(folder._frames, _CSV_HEADER)
+        return folder
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no frame was written down yet."""
+        return not self._records
+
+    def restarted(self, config: SlamConfig) -> RunFolder:
+        """Begin anew in the same folder: another world, or another time. This object is closed.
+
+        What was written so far is kept in ``previous/``, itself a run's folder, in place of what was kept there before.
+
+        Raises:
+            RunFolderError: it cannot be written; then nothing more can be.
+        """
+        previous = self.path / PREVIOUS
+        try:
+            self.close()
+            shutil.rmtree(previous, ignore_errors=True)
+            previous.mkdir()
+            shutil.copy2(self.path / RUN, previous)  # which tells that this is a run's folder, so it stays, too
+            for name in FILES:
+                if name != RUN and (self.path / name).exists():
+                    (self.path / name).replace(previous / name)
+            information = json.loads((previous / RUN).read_text())
+            return self._begin(self.path, config, information | {'camera': None, 'started': _now()})
+        except OSError as error:
+            raise RunFolderError(f'{self.path}: no new run can begin: {error.strerror}') from None
+
+    def moved(self, path: Path) -> RunFolder:
+        """Go on in another folder, with a copy of what is written so far. This object is closed, if that works.
+
+        Raises:
+            RunFolderError: something is there already, or it cannot be written.
+        """
+        check_is_free(path)
+        temporary = path.with_name(f'.{path.name}.{os.getpid()}')
+        try:
+            shutil.copytree(self.path, temporary)
+            temporary.replace(path)
+        except OSError as error:  # copytree's own error has no strerror
+            why = error.strerror or error
+            raise RunFolderError(f'{path}: cannot be written: {why}; choose another folder') from None
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+        self.close()
+        return RunFolder(path, self._records)
 
     def append(self, frame: RgbdFrame, result: FrameResult, process_s: float, decode_s: float | None = None) -> None:
         """Write down one frame.
@@ -167,16 +226,17 @@ class RunFolder:
             process_s: wall time in ``Slam.process``.
             decode_s: wall time reading and decoding; None where that went on beside SLAM.
         """
-        if not self._records:
-            self._write_camera(frame.camera)
-        self._trajectory.write(_trajectory_line(result) + '\n')
-        self._trajectory.flush()
         record = _record(result, process_s, decode_s)
-        _write_csv_row(self._frames, _csv_row(record))
         self._records.append(record)
+        self._trajectory.write(_trajectory_line(result) + '\n')
+        _write_csv_row(self._frames, _csv_row(record))
+        self._trajectory.flush()
+        if len(self._records) == 1:
+            self._write_camera(frame.camera)
 
     def save(self, slam: Slam) -> Metrics:
-        """Write ``map.ply`` and ``metrics.json`` as of now; may be called again later."""
+        """Write ``map.ply``, ``metrics.json`` and the settings as of now; may be called again later."""
+        replace_text(self.path / CONFIG, to_yaml(slam.config))
         gaussians = slam.map.gaussians
         write_ply(self.path / MAP, gaussians)
         metrics = run_metrics(self._records, len(gaussians), environment.peak_rss_mb())
@@ -294,6 +354,12 @@ def read_run(path: Path) -> RunRecord:
         raise RunFolderError(f'{path} cannot be read: {error!r}; was it written by another version?') from None
 
 
+def check_is_free(path: Path) -> None:
+    """Raise RunFolderError unless nothing is there, or an empty folder."""
+    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        raise RunFolderError(f'{path} exists: choose another folder{_overwrite_hint(path)}')
+
+
 def _overwrite_hint(path: Path) -> str:
     return ', or replace the run in it with --overwrite (the node: overwrite:=true)' if (path / RUN).is_file() else ''
 
@@ -312,18 +378,22 @@ def _remove_run(path: Path) -> None:
 
 
 def _is_of_a_run(name: str) -> bool:
-    return name in FILES or name == CHECKPOINTS or is_unfinished(name, FILES)
+    return name in (*FILES, CHECKPOINTS, PREVIOUS) or is_unfinished(name, FILES)
 
 
 def _run_information(description: RunDescription) -> dict[str, Any]:
     return {
         **asdict(description),
         'camera': None,
-        'started': datetime.now(timezone.utc).isoformat(timespec='seconds'),
+        'started': _now(),
         'commit': environment.commit(),
         'machine': environment.machine(),
         'versions': environment.versions(),
     }
+
+
+def _now() -> str:
+    return datetime.now(timezone.utc).isoformat(timespec='seconds')
 
 
 def _to_json(values: dict[str, Any]) -> str:

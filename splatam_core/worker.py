@@ -40,6 +40,7 @@ class SlamWorker:
         *,
         queue_size: int,
         when_full: WhenFull,
+        before_frame: Callable[[Slam, RgbdFrame], None] | None = None,
     ) -> None:
         """Start the thread.
 
@@ -49,6 +50,7 @@ class SlamWorker:
             on_bad_frame: called on the worker's thread with each frame that Slam refused.
             queue_size: frames that may wait, besides the one being processed.
             when_full: what ``submit`` does when that many wait.
+            before_frame: called on the worker's thread before each frame; may change the Slam.
 
         Raises:
             ValueError: queue_size below 1, or an unknown when_full.
@@ -62,6 +64,7 @@ class SlamWorker:
         self._on_bad_frame = on_bad_frame
         self._queue_size = queue_size
         self._when_full = when_full
+        self._before_frame = before_frame
         self._frames: deque[RgbdFrame] = deque()
         self._tasks: deque[tuple[Future[Any], Callable[[Slam], Any]]] = deque()
         self._busy = False
@@ -162,6 +165,8 @@ class SlamWorker:
             return lambda: self._process(frame)
 
     def _process(self, frame: RgbdFrame) -> None:
+        if self._before_frame is not None:
+            self._before_frame(self._slam, frame)
         try:
             result = self._slam.process(frame)
         except FrameError as error:

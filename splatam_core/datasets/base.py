@@ -1,22 +1,22 @@
-"""What every reader offers, and what readers share: windows of a recording, image files, nominal stamps."""
+"""What every reader offers, and what is common to all: windows of a recording, nominal stamps, depth counts."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core.camera import CameraFile, PinholeCamera, read_camera_file
+from splatam_core.camera import PinholeCamera
 from splatam_core.errors import DatasetError
 from splatam_core.types import RgbdFrame, Trajectory
 
 FIRST_STAMP_NS = 1_000_000_000
 NOMINAL_RATE_HZ = 30
+MIN_SIZE = 16
+SPLITS = ('train', 'test')
 
 
 class Sequence(Protocol):
@@ -66,18 +66,37 @@ class ReadOptions:
         start: index of the first frame.
         max_frames: how many frames at most; None reads to the end.
         topics: which topics of a bag to read.
+        stride: every how manieth frame is read, from the first on.
+        crop: pixels cut off each edge, after resizing.
+        split: which part of a dataset that comes in parts, ``train`` or ``test``; None reads ``train``.
+        skip_bad: leave out the frames that the dataset itself flags as bad.
     """
 
     width: int | None = None
     start: int = 0
     max_frames: int | None = None
     topics: BagTopics = BagTopics()
+    stride: int = 1
+    crop: int = 0
+    split: str | None = None
+    skip_bad: bool = False
 
     def __post_init__(self) -> None:
         if self.start < 0:
             raise DatasetError(f'start {self.start}: the first frame has index 0')
         if self.max_frames is not None and self.max_frames < 1:
             raise DatasetError(f'max_frames {self.max_frames}: must be at least 1')
+        if self.stride < 1:
+            raise DatasetError(f'stride {self.stride}: must be at least 1')
+        if self.crop < 0:
+            raise DatasetError(f'crop {self.crop}: must be at least 0 pixels')
+        if self.split not in (None, *SPLITS):
+            raise DatasetError(f"split '{self.split}' is not one of {', '.join(SPLITS)}")
+
+    @property
+    def last_asked(self) -> int | None:
+        """Index of the last frame that could be asked for; None = the recording's last."""
+        return None if self.max_frames is None else self.start + (self.max_frames - 1) * self.stride
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +110,9 @@ class Format:
         open: opens the whole recording; the window of ``ReadOptions`` is cut by the caller.
         is_path: whether a source is a file or folder.
         has_topics: whether topics can be chosen.
+        has_splits: whether it comes as ``train`` and ``test``.
+        flags_bad: whether it says which frames are bad.
+        is_last_resort: taken only where no other format fits.
     """
 
     name: str
@@ -99,24 +121,53 @@ class Format:
     open: Callable[[str, ReadOptions], Sequence]
     is_path: bool = True
     has_topics: bool = False
+    has_splits: bool = False
+    flags_bad: bool = False
+    is_last_resort: bool = False
 
 
 class Window:
-    """Frames ``start`` to ``stop`` of another sequence. The truth stays whole."""
+    """Some frames of another sequence, their edges cut off. The truth stays whole.
 
-    def __init__(self, sequence: Sequence, start: int, stop: int) -> None:
+    Attributes:
+        name, camera, depth_scale: as ``Sequence`` has them.
+    """
+
+    def __init__(self, sequence: Sequence, indices: range, crop: int = 0) -> None:
+        """Choose frames.
+
+        Args:
+            sequence: where they are.
+            indices: which.
+            crop: pixels to cut off each edge.
+
+        Raises:
+            DatasetError: cropping leaves less than 16 pixels.
+        """
+        whole = sequence.camera
+        width, height = whole.width - 2 * crop, whole.height - 2 * crop
+        if crop and min(width, height) < MIN_SIZE:
+            raise DatasetError(
+                f'crop {crop}: leaves {max(width, 0)}x{max(height, 0)} of the {whole.width}x{whole.height} frames; '
+                f'at least {MIN_SIZE} pixels must be left'
+            )
         self.name = sequence.name
-        self.camera = sequence.camera
+        self.camera = whole.cropped(width, height, crop, crop)
         self.depth_scale = sequence.depth_scale
         self._sequence = sequence
-        self._indices = range(start, stop)
+        self._indices = indices
+        self._rows, self._columns = slice(crop, crop + height), slice(crop, crop + width)
 
     def __len__(self) -> int:
         return len(self._indices)
 
     def __getitem__(self, index: int) -> RgbdFrame:
         """Read one frame of the window."""
-        return self._sequence[self._indices[index]]
+        frame = self._sequence[self._indices[index]]
+        if self.camera == self._sequence.camera:
+            return frame
+        rgb, depth_m = frame.rgb[self._rows, self._columns], frame.depth_m[self._rows, self._columns]
+        return replace(frame, rgb=np.ascontiguousarray(rgb), depth_m=np.ascontiguousarray(depth_m), camera=self.camera)
 
     def ground_truth(self) -> Trajectory | None:
         """The truth of the whole recording."""
@@ -124,7 +175,7 @@ class Window:
 
 
 def cut(sequence: Sequence, options: ReadOptions) -> Sequence:
-    """The window of a sequence that the options ask for.
+    """The part of a sequence that the options ask for.
 
     Raises:
         DatasetError: it would be empty.
@@ -132,60 +183,19 @@ def cut(sequence: Sequence, options: ReadOptions) -> Sequence:
     length = len(sequence)
     if options.start >= length:
         raise DatasetError(f'{sequence.name}: start {options.start} is beyond its {length} frames')
-    stop = length if options.max_frames is None else min(length, options.start + options.max_frames)
-    return sequence if (options.start, stop) == (0, length) else Window(sequence, options.start, stop)
+    indices = range(options.start, length, options.stride)[: options.max_frames]
+    whole = indices == range(length) and options.crop == 0
+    return sequence if whole else Window(sequence, indices, options.crop)
 
 
-def nominal_stamp_ns(frame: int) -> int:
-    """Stamp of a frame whose recording has none: from 1 s on, at 30 Hz."""
-    return FIRST_STAMP_NS + frame * 1_000_000_000 // NOMINAL_RATE_HZ
-
-
-def camera_file(folder: Path) -> CameraFile | None:
-    """What a folder's ``camera.yaml`` states, or None where there is none.
-
-    Raises:
-        CameraError: the file is there and cannot be used.
-    """
-    path = folder / 'camera.yaml'
-    return read_camera_file(path) if path.exists() else None
-
-
-def read_color(path: Path) -> NDArray[np.uint8]:
-    """Read a colour image file as RGB, [H, W, 3].
-
-    Raises:
-        DatasetError: the file is missing or no image.
-    """
-    image = _read_image(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-
-def read_depth_counts(path: Path) -> NDArray[np.uint16]:
-    """Read a 16-bit depth image file, [H, W] counts.
-
-    Raises:
-        DatasetError: the file is missing, no image, or not one channel of 16 bits.
-    """
-    counts = _read_image(path, cv2.IMREAD_UNCHANGED)
-    if counts.dtype != np.uint16 or counts.ndim != 2:
-        raise DatasetError(f'{path}: depth must be one channel of 16 bits, got {counts.dtype} {counts.shape}')
-    return counts
+def nominal_stamp_ns(frame: int, rate_hz: int = NOMINAL_RATE_HZ) -> int:
+    """Stamp of a frame whose recording has none: from 1 s on, at its nominal rate."""
+    return FIRST_STAMP_NS + frame * 1_000_000_000 // rate_hz
 
 
 def metres(counts: NDArray[np.uint16], depth_scale: float) -> NDArray[np.float32]:
     """Depth counts as float32 metres; 0 stays 0."""
     return counts.astype(np.float32) / np.float32(depth_scale)
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file.
-
-    Raises:
-        DatasetError: the file is missing or no image.
-    """
-    height, width = read_color(path).shape[:2]
-    return width, height
 
 
 def check_increasing(stamps_ns: NDArray[np.int64], name: str) -> None:
@@ -201,14 +211,3 @@ def check_increasing(stamps_ns: NDArray[np.int64], name: str) -> None:
             f'{name}: time does not increase from frame {at - 1} ({int(stamps_ns[at - 1])} ns) to frame {at} '
             f'({int(stamps_ns[at])} ns); cut the recording there'
         )
-
-
-def _read_image(path: Path, flags: int) -> NDArray[np.uint8]:
-    try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as error:
-        raise DatasetError(f'{path}: cannot be read: {error.strerror}') from None
-    image = cv2.imdecode(data, flags) if data.size else None
-    if image is None:
-        raise DatasetError(f'{path}: is not an image that OpenCV can read ({data.size} bytes); is the copy complete?')
-    return image

@@ -12,6 +12,15 @@ READERS = {
     'synthetic': 'splatam_core.datasets.synthetic',
     'tum': 'splatam_core.datasets.tum',
     'sevenscenes': 'splatam_core.datasets.sevenscenes',
+    'replica': 'splatam_core.datasets.replica',
+    'replica_v2': 'splatam_core.datasets.replica_v2',
+    'scannet': 'splatam_core.datasets.scannet',
+    'scannetpp': 'splatam_core.datasets.scannetpp',
+    'scannetpp_iphone': 'splatam_core.datasets.scannetpp_iphone',
+    'nerfcapture': 'splatam_core.datasets.nerfcapture',
+    'record3d': 'splatam_core.datasets.record3d',
+    'icl': 'splatam_core.datasets.icl',
+    'folder': 'splatam_core.datasets.folder',
     'rosbag': 'splatam_core.datasets.rosbag',
 }
 """Format name to module. A module holds its row as ``FORMAT`` and is imported when it is looked at."""
@@ -25,28 +34,50 @@ def open_sequence(
     start: int = 0,
     max_frames: int | None = None,
     topics: BagTopics | None = None,
+    stride: int = 1,
+    crop: int = 0,
+    split: str | None = None,
+    skip_bad: bool = False,
 ) -> Sequence:
     """Open a recording.
 
     Args:
-        source: a dataset folder, a rosbag2 (folder, ``.db3``, ``.mcap``), or ``synthetic[:options]``.
+        source: a dataset folder, a bag (rosbag2 folder, ``.db3``, ``.mcap``; ROS 1 ``.bag``), or
+            ``synthetic[:options]``.
         format: one of ``READERS``; guessed from the source when None.
         width: width of the frames in pixels; None keeps the recorded size.
         start: index of the first frame.
         max_frames: how many frames at most.
         topics: which topics of a bag to read; those left None are found by type.
+        stride: every how manieth frame is read; ``max_frames`` counts those.
+        crop: pixels cut off each edge of the frames, after resizing.
+        split: ``train`` or ``test``, of a dataset that comes so; None reads ``train``.
+        skip_bad: leave out the frames that the dataset itself flags as bad.
 
     Raises:
         DatasetError: the source is of no known format, is broken, or has no such frames.
         CameraError: its camera cannot be used.
     """
-    options = ReadOptions(width, start, max_frames, topics or BagTopics())
+    options = ReadOptions(width, start, max_frames, topics or BagTopics(), stride, crop, split, skip_bad)
     reader = _reader(format) if format is not None else _guess(source)
     if reader.is_path and not Path(source).exists():
         raise DatasetError(f'{source}: there is no such file or folder')
-    if not reader.has_topics and options.topics != BagTopics():
-        raise DatasetError(f'{source}: is read as {reader.name}, where there are no topics to choose; leave them out')
+    if not reader.recognises(source):
+        raise DatasetError(f'{source}: {_found(Path(source))}; {reader.name} expects {reader.expects}')
+    _check_options(source, reader, options)
     return cut(reader.open(source, options), options)
+
+
+def _check_options(source: str, reader: Format, options: ReadOptions) -> None:
+    """Make sure that nothing is asked for that the format cannot give."""
+    asked_in_vain = [
+        ('there are no topics to choose', options.topics != BagTopics() and not reader.has_topics),
+        ('there is no train or test split', options.split is not None and not reader.has_splits),
+        ('no frames are flagged as bad', options.skip_bad and not reader.flags_bad),
+    ]
+    for reason, is_so in asked_in_vain:
+        if is_so:
+            raise DatasetError(f'{source}: is read as {reader.name}, where {reason}; leave that option out')
 
 
 def _reader(name: str) -> Format:
@@ -61,6 +92,7 @@ def _guess(source: str) -> Format:
         reader = _reader(name)
         if reader.recognises(source):
             fitting.append(reader)
+    fitting = [reader for reader in fitting if not reader.is_last_resort] or fitting
     if len(fitting) == 1:
         return fitting[0]
     if fitting:

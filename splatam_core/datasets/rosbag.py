@@ -1,9 +1,9 @@
-"""rosbag2 recordings: a folder with ``metadata.yaml``, or one ``.db3`` or ``.mcap`` file.
+"""ROS bags: a rosbag2 folder with ``metadata.yaml``, one ``.db3`` or ``.mcap`` file, or a ROS 1 ``.bag`` file.
 
 ::
 
-    my_bag/
-        metadata.yaml
+    my_bag/                                 my_recording.bag        # ROS 1
+        metadata.yaml                       camera.yaml
         my_bag_0.db3  or  my_bag_0.mcap
         camera.yaml             # may be missing; wins over the bag's CameraInfo
 
@@ -26,7 +26,7 @@ import logging
 import struct
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -34,6 +34,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags import rosbag1
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -44,7 +45,7 @@ from msg_adapters.errors import MessageError
 from msg_adapters.factory import RosbagsMessages
 from msg_adapters.synchronizer import RgbdSet, RgbdSynchronizer
 from splatam_core.camera import CameraCalibration, CameraFile, FrameFactory
-from splatam_core.datasets import base
+from splatam_core.datasets import base, files
 from splatam_core.errors import CameraError, DatasetError, FrameError, SplatamError
 from splatam_core.trajectory import stamp_text
 from splatam_core.types import RgbdFrame, Trajectory
@@ -57,6 +58,7 @@ POSE = 'geometry_msgs/msg/PoseStamped'
 RGB_TOPIC, DEPTH_TOPIC, INFO_TOPIC, TRUTH_TOPIC = '/rgb/image', '/depth/image', '/rgb/camera_info', '/ground_truth/pose'
 CAMERA_FRAME, WORLD_FRAME = 'camera_optical_frame', 'world'
 
+ROS1_SUFFIX = '.bag'
 MAX_INTERVAL_NS = 20_000_000
 QUEUE_SIZE = 300  # ten seconds of one stream before the other begins
 JUMP_NS = 1_000_000_000
@@ -72,7 +74,7 @@ _log = logging.getLogger(__name__)
 
 
 class BagSequence:
-    """A rosbag2; see the module's text for what is found in it."""
+    """A bag; see the module's text for what is found in it."""
 
     def __init__(self, path: Path, *, width: int | None = None, topics: base.BagTopics | None = None) -> None:
         """Find the topics of a bag and pair its images.
@@ -83,7 +85,7 @@ class BagSequence:
             CameraError: the camera cannot be used.
         """
         bag = _Bag(path)
-        stated = base.camera_file(path if path.is_dir() else path.parent)
+        stated = files.camera_file(path if path.is_dir() else path.parent)
         chosen = _choose_topics(bag, topics or base.BagTopics(), need_info=stated is None)
         index = _Index.of(bag, chosen)
         self._frames = FrameFactory(stated.calibration if stated else _calibration(bag, index), width)
@@ -124,8 +126,9 @@ class _Bag:
     def __init__(self, path: Path) -> None:
         _check_closed(path)
         self.path = path
+        self.is_ros1 = path.suffix == ROS1_SUFFIX
         self._encodings: dict[str, str] = {}
-        with _reading(path), Reader(path) as reader:
+        with _reading(path), self._open() as reader:
             self.connections = [
                 connection._replace(owner=None) for connection in reader.connections if connection.msgcount
             ]
@@ -147,7 +150,7 @@ class _Bag:
     def messages(self, topics: Iterable[str], start_ns: int | None = None) -> Iterator[tuple[str, int, bytes]]:
         """(topic, time of recording, serialized message), from a time of recording on."""
         wanted = set(topics)
-        with _reading(self.path), Reader(self.path) as reader:
+        with _reading(self.path), self._open() as reader:
             connections = [connection for connection in reader.connections if connection.topic in wanted]
             for connection, recorded_ns, data in reader.messages(connections, start=start_ns):
                 yield connection.topic, recorded_ns, data
@@ -163,9 +166,27 @@ class _Bag:
         return self._encodings[topic]
 
     def decode(self, topic: str, data: bytes) -> Any:
-        """A message as rosbags' object of its type."""
+        """A message as rosbags' object of its type in ROS 2."""
+        type_name = self.type_of(topic)
         with _reading(self.path):
-            return _types().deserialize_cdr(data, self.type_of(topic))
+            if not self.is_ros1:
+                return _types().deserialize_cdr(data, type_name)
+            message = _types(Stores.ROS1_NOETIC).deserialize_ros1(data, type_name)
+            return _ros2_info(message) if type_name == INFO else message
+
+    def stamp_ns(self, topic: str, data: bytes) -> int:
+        """The header's stamp; a header is the first field of every type read here."""
+        if len(data) < 12:
+            raise DatasetError(f'{self.path}: a message on {topic} has {len(data)} bytes, too few for a header')
+        if self.is_ros1:
+            form = '<II'  # after the header's sequence number
+        else:
+            form = '<iI' if data[1] & 1 else '>iI'  # after four bytes that say how CDR is encoded
+        seconds, nanoseconds = struct.unpack_from(form, data, 4)
+        return seconds * 1_000_000_000 + nanoseconds
+
+    def _open(self) -> rosbag1.Reader | Reader:
+        return (rosbag1.Reader if self.is_ros1 else Reader)(self.path)
 
 
 class _Stream:
@@ -243,7 +264,7 @@ class _Index:
         truth: dict[int, NDArray[np.float64]] = {}
         for topic, recorded_ns, data in bag.messages(kinds):
             counts[topic] += 1
-            stamp_ns = _stamp_ns(bag, topic, data)
+            stamp_ns = bag.stamp_ns(topic, data)
             if kinds[topic] == 'info':
                 infos.setdefault(_calibration_of(bag, topic, data), stamp_ns)
             elif kinds[topic] == 'truth':
@@ -258,13 +279,12 @@ def _check_closed(path: Path) -> None:
     """A folder without its metadata is a recording that was interrupted."""
     if not path.is_dir() or (path / 'metadata.yaml').exists():
         return
-    files = sorted(file.name for suffix in ('db3', 'mcap') for file in path.glob(f'*.{suffix}'))
-    if files:
+    storages = sorted(file.name for suffix in ('db3', 'mcap') for file in path.glob(f'*.{suffix}'))
+    if storages:
         raise DatasetError(
             f'{path}: there is no metadata.yaml, the recording was not closed; run "ros2 bag reindex {path.name}" '
-            f'or open {files[0]} itself'
+            f'or open {storages[0]} itself'
         )
-    raise DatasetError(f'{path}: there is no metadata.yaml and no .db3 or .mcap file; this is no rosbag2')
 
 
 def _check_complete(bag: _Bag, counts: dict[str, int]) -> None:
@@ -284,21 +304,21 @@ def _reading(path: Path) -> Iterator[None]:
     except SplatamError:
         raise
     except Exception as error:  # broken files surface as any of a dozen types, assertions included
+        kind = 'a ROS 1 bag' if path.suffix == ROS1_SUFFIX else 'a rosbag2'
         reason = ' '.join(str(error).split()) or type(error).__name__
-        raise DatasetError(f'{path}: cannot be read as a rosbag2, it may be truncated: {reason}') from error
+        raise DatasetError(f'{path}: cannot be read as {kind}, it may be truncated: {reason}') from error
 
 
-@lru_cache(maxsize=1)
-def _types() -> Typestore:
-    return get_typestore(Stores.ROS2_JAZZY)
+@lru_cache(maxsize=2)
+def _types(store: Stores = Stores.ROS2_JAZZY) -> Typestore:
+    return get_typestore(store)
 
 
-def _stamp_ns(bag: _Bag, topic: str, data: bytes) -> int:
-    """The header's stamp; a header is the first field of every type read here, after four bytes of CDR."""
-    if len(data) < 12:
-        raise DatasetError(f'{bag.path}: a message on {topic} has {len(data)} bytes, too few for a header')
-    seconds, nanoseconds = struct.unpack_from('<iI' if data[1] & 1 else '>iI', data, 4)
-    return seconds * 1_000_000_000 + nanoseconds
+def _ros2_info(info: Any) -> Any:
+    """A ROS 1 CameraInfo, whose matrices have capital names, as ROS 2 has it."""
+    return _types().types[INFO](
+        **{field.name.lower(): getattr(info, field.name) for field in fields(info) if field.init}
+    )
 
 
 def _calibration_of(bag: _Bag, topic: str, data: bytes) -> CameraCalibration:
@@ -507,7 +527,7 @@ def _recognises(source: str) -> bool:
     path = Path(source)
     if path.is_dir():
         return (path / 'metadata.yaml').is_file() or any(any(path.glob(f'*.{suffix}')) for suffix in ('db3', 'mcap'))
-    return path.suffix in ('.db3', '.mcap') and path.is_file()
+    return path.suffix in ('.db3', '.mcap', ROS1_SUFFIX) and path.is_file()
 
 
 def _open(source: str, options: base.ReadOptions) -> BagSequence:
@@ -515,5 +535,6 @@ def _open(source: str, options: base.ReadOptions) -> BagSequence:
 
 
 FORMAT = base.Format(
-    'rosbag', 'a rosbag2 folder with metadata.yaml, or a .db3 or .mcap file', _recognises, _open, has_topics=True
-)
+    'rosbag', 'a rosbag2 folder with metadata.yaml, a .db3 or .mcap file, or a ROS 1 .bag file', _recognises, _open,
+    has_topics=True,
+)  # fmt: skip

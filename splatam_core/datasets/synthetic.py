@@ -148,7 +148,7 @@ def _recognises(source: str) -> bool:
 
 def _open(source: str, options: base.ReadOptions) -> SyntheticSequence:
     given = _parse(source)
-    asked = LOOP_FRAMES if options.max_frames is None else options.start + options.max_frames
+    asked = LOOP_FRAMES if options.last_asked is None else options.last_asked + 1
     return SyntheticSequence(
         seed=_integer('seed', given.get('seed', '0'), 0),
         noise=_switch('noise', given.get('noise', 'on')),

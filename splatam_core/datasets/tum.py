@@ -23,11 +23,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core.camera import CameraCalibration, FrameFactory, PinholeCamera
-from splatam_core.datasets import base
+from splatam_core.camera import CameraCalibration, PinholeCamera
+from splatam_core.datasets import base, files
+from splatam_core.datasets.pairs import DepthFormat, ImagePair, ImagePairs
 from splatam_core.errors import DatasetError
 from splatam_core.trajectory import read_trajectory, stamp_from_text, stamp_text
-from splatam_core.types import RgbdFrame, Trajectory
 
 DEFAULT_DEPTH_SCALE = 5000.0
 MAX_INTERVAL_NS = 20_000_000
@@ -46,39 +46,19 @@ KNOWN_CAMERAS = {
 """The calibrations published with the dataset; freiburg3 images are rectified already."""
 
 
-class TumSequence:
-    """A TUM RGB-D folder; see the module's text for its layout."""
+def read(folder: Path, *, width: int | None = None, max_interval_ns: int = MAX_INTERVAL_NS) -> ImagePairs:
+    """Read the lists of a folder and pair its images.
 
-    def __init__(self, folder: Path, *, width: int | None = None, max_interval_ns: int = MAX_INTERVAL_NS) -> None:
-        """Read the lists of a folder and pair its images.
-
-        Raises:
-            DatasetError: a list is missing or broken, no images pair up, or the camera is unknown.
-            CameraError: its ``camera.yaml`` cannot be used.
-        """
-        stated = base.camera_file(folder)
-        self._frames = FrameFactory(stated.calibration if stated else _known_camera(folder), width)
-        self._folder = folder
-        self.name = folder.resolve().name
-        self.camera = self._frames.camera
-        self.depth_scale: float | None = (stated.depth_scale if stated else None) or DEFAULT_DEPTH_SCALE
-        self._pairs = _pairs(folder, max_interval_ns)
-
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def __getitem__(self, index: int) -> RgbdFrame:
-        """Read one frame."""
-        stamp_ns, rgb_path, depth_path = self._pairs[index]
-        counts = base.read_depth_counts(self._folder / depth_path)
-        return self._frames.make(
-            stamp_ns, base.read_color(self._folder / rgb_path), base.metres(counts, self.depth_scale)
-        )
-
-    def ground_truth(self) -> Trajectory | None:
-        """The poses of ``groundtruth.txt``; None where there is no such file."""
-        path = self._folder / 'groundtruth.txt'
-        return read_trajectory(path) if path.exists() else None
+    Raises:
+        DatasetError: a list is missing or broken, no images pair up, or the camera is unknown.
+        CameraError: its ``camera.yaml`` cannot be used.
+    """
+    camera = files.camera_of(folder, lambda: _known_camera(folder), DEFAULT_DEPTH_SCALE)
+    truth = folder / 'groundtruth.txt'
+    return ImagePairs(
+        folder.resolve().name, _pairs(folder, max_interval_ns), camera.calibration, DepthFormat(camera.depth_scale),
+        width=width, truth=lambda: read_trajectory(truth) if truth.exists() else None,
+    )  # fmt: skip
 
 
 def associate(a_ns: NDArray[np.int64], b_ns: NDArray[np.int64], max_interval_ns: int) -> list[tuple[int, int]]:
@@ -110,7 +90,7 @@ def _known_camera(folder: Path) -> CameraCalibration:
     return KNOWN_CAMERAS[match.group(1)]
 
 
-def _pairs(folder: Path, max_interval_ns: int) -> list[tuple[int, str, str]]:
+def _pairs(folder: Path, max_interval_ns: int) -> list[ImagePair]:
     rgb, depth = _read_list(folder / 'rgb.txt'), _read_list(folder / 'depth.txt')
     pairs = associate(_stamps_ns(rgb), _stamps_ns(depth), max_interval_ns)
     if not pairs:
@@ -118,7 +98,7 @@ def _pairs(folder: Path, max_interval_ns: int) -> list[tuple[int, str, str]]:
             f'{folder}: none of {len(rgb)} colour and {len(depth)} depth images are within '
             f'{max_interval_ns / 1e6:g} ms of each other; are both lists stamped by the same clock?'
         )
-    return [(*rgb[i], depth[j][1]) for i, j in pairs]
+    return [ImagePair(rgb[i][0], folder / rgb[i][1], folder / depth[j][1]) for i, j in pairs]
 
 
 def _stamps_ns(rows: list[tuple[int, str]]) -> NDArray[np.int64]:
@@ -154,8 +134,8 @@ def _recognises(source: str) -> bool:
     return (Path(source) / 'rgb.txt').is_file() and (Path(source) / 'depth.txt').is_file()
 
 
-def _open(source: str, options: base.ReadOptions) -> TumSequence:
-    return TumSequence(Path(source), width=options.width)
+def _open(source: str, options: base.ReadOptions) -> ImagePairs:
+    return read(Path(source), width=options.width)
 
 
 FORMAT = base.Format('tum', 'a folder with rgb.txt and depth.txt', _recognises, _open)

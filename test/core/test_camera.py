@@ -78,8 +78,23 @@ def test_readings_that_are_none_become_zero() -> None:
 
 def test_wrong_sizes_are_named() -> None:
     factory = FrameFactory(CameraCalibration(CAMERA))
-    with pytest.raises(FrameError, match='depth image is 32x24 .* calibrated for 64x48'):
-        factory.make(1, np.zeros((48, 64, 3), np.uint8), np.ones((24, 32), np.float32))
+    with pytest.raises(FrameError, match='colour image is 32x24 .* calibrated for 64x48'):
+        factory.make(1, np.zeros((24, 32, 3), np.uint8), np.ones((48, 64), np.float32))
+    with pytest.raises(FrameError, match='depth image is 64x40.* 64x48 .*aligned_depth_to_color'):
+        factory.make(1, np.zeros((48, 64, 3), np.uint8), np.ones((40, 64), np.float32))
+
+
+@pytest.mark.parametrize('size', [(24, 32), (96, 128), (36, 48), (12, 17)])
+def test_depth_of_another_resolution_is_brought_to_colour_s(size: tuple[int, int]) -> None:
+    height, width = size
+    v, u = np.mgrid[:height, :width].astype(np.float32)
+    depth = 1 + 1000 * v + u
+    frame = FrameFactory(CameraCalibration(CAMERA)).make(1, np.zeros((48, 64, 3), np.uint8), depth)
+    assert frame.depth_m.shape == (48, 64) and set(frame.depth_m.flat) <= set(depth.flat)  # nothing is mixed
+    # A pixel's centre is its integer index: the nearest centre of the other grid, at most half a pixel of it away.
+    y, x = (np.indices((48, 64)) + 0.5) * np.array([height / 48, width / 64])[:, None, None] - 0.5
+    found_v, found_u = np.divmod(frame.depth_m - 1, 1000)
+    assert np.abs(found_v - y).max() <= 0.5 and np.abs(found_u - x).max() <= 0.5
 
 
 @pytest.mark.parametrize('values', [(0.0, 1.0), (np.nan, 1.0), (-5.0, 1.0)])

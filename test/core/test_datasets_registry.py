@@ -44,8 +44,8 @@ def test_ambiguous_folder(tmp_path):
 
 
 def test_unknown_format(tmp_path):
-    with pytest.raises(DatasetError, match="format 'replica' is not one of synthetic, tum, sevenscenes, rosbag"):
-        open_sequence(str(tmp_path), format='replica')
+    with pytest.raises(DatasetError, match="format 'kitti' is not one of synthetic, tum, sevenscenes, replica, "):
+        open_sequence(str(tmp_path), format='kitti')
 
 
 @pytest.mark.parametrize('format', [name for name in READERS if name != 'synthetic'])
@@ -59,10 +59,39 @@ def test_topics_belong_to_bags():
         open_sequence('synthetic', topics=BagTopics(rgb='/rgb'))
 
 
-@pytest.mark.parametrize(('start', 'max_frames'), [(-1, None), (0, 0)])
-def test_impossible_window(start, max_frames):
-    with pytest.raises(DatasetError):
-        open_sequence('synthetic', start=start, max_frames=max_frames)
+@pytest.mark.parametrize(
+    ('options', 'message'),
+    [
+        ({'start': -1}, 'start -1'),
+        ({'max_frames': 0}, 'max_frames 0'),
+        ({'stride': 0}, 'stride 0: must be at least 1'),
+        ({'crop': -1}, 'crop -1: must be at least 0'),
+        ({'crop': 20, 'width': 64}, 'crop 20: leaves 24x8 of the 64x48 frames'),
+        ({'split': 'train'}, 'read as synthetic, where there is no train or test split; leave that option out'),
+        ({'skip_bad': True}, 'read as synthetic, where no frames are flagged as bad'),
+    ],
+)
+def test_impossible_window(options, message):
+    with pytest.raises(DatasetError, match=message):
+        open_sequence('synthetic', **options)
+
+
+def test_stride_counts_from_the_start(room):
+    whole = room(frames=9, width=32)
+    thinned = open_sequence('synthetic:frames=9', start=1, stride=3, width=32)
+    assert [frame.stamp_ns for frame in thinned] == [whole[i].stamp_ns for i in (1, 4, 7)]
+    assert len(open_sequence('synthetic:frames=9', start=1, stride=3, max_frames=2, width=32)) == 2
+    assert len(open_sequence('synthetic', start=1, stride=3, max_frames=4, width=32)) == 4  # frame 10 is the last asked
+
+
+def test_crop_keeps_what_a_pixel_sees(room):
+    whole, cropped = room(frames=1, width=64)[0], open_sequence('synthetic:frames=1', crop=5, width=64)
+    assert np.array_equal(cropped[0].rgb, whole.rgb[5:-5, 5:-5])
+    assert np.array_equal(cropped[0].depth_m, whole.depth_m[5:-5, 5:-5])
+    a, b = cropped[0].camera, whole.camera
+    assert (a.width, a.height, a.fx, a.fy) == (54, 38, b.fx, b.fy)
+    assert (a.cx, a.cy) == (b.cx - 5, b.cy - 5)
+    assert a == cropped.camera
 
 
 def test_start_beyond_the_end():

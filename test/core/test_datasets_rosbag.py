@@ -509,7 +509,7 @@ def test_broken_metadata(tmp_path, text):
 
 
 def test_no_bag_at_all(tmp_path):
-    with pytest.raises(DatasetError, match=r'no metadata\.yaml and no \.db3 or \.mcap'):
+    with pytest.raises(DatasetError, match='is an empty folder; rosbag expects a rosbag2 folder'):
         open_sequence(str(tmp_path), format='rosbag')
 
 

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from splatam_core.datasets import tum
 from splatam_core.datasets.registry import open_sequence
-from splatam_core.datasets.tum import KNOWN_CAMERAS, TumSequence, associate
+from splatam_core.datasets.tum import KNOWN_CAMERAS, associate
 from splatam_core.errors import CameraError, DatasetError, FrameError
 
 CAMERA_YAML = 'width: 64\nheight: 48\nfx: 50\nfy: 51\ncx: 31.5\ncy: 23.5\n'
@@ -52,7 +53,7 @@ def test_frames_have_colour_stamp_rgb_order_and_metres(tmp_path):
 def test_each_depth_is_used_once_by_the_nearest_colour(tmp_path):
     # colour 0 and 1 both have depth 0 within reach; 1 is nearer. Colour 2 has none within 20 ms.
     folder = write_tum(tmp_path, [1.0, 1.01, 1.2], [1.012, 1.3])
-    sequence = TumSequence(folder)
+    sequence = tum.read(folder)
     assert [sequence[i].rgb[0, 0, 0] for i in range(len(sequence))] == [10]
 
 
@@ -69,7 +70,7 @@ def test_associate_limit_is_inclusive(interval, pairs):
 
 def test_nothing_pairs(tmp_path):
     with pytest.raises(DatasetError, match='none of 1 colour and 1 depth images are within 20 ms'):
-        TumSequence(write_tum(tmp_path, [1.0], [2.0]))
+        tum.read(write_tum(tmp_path, [1.0], [2.0]))
 
 
 @pytest.mark.parametrize(
@@ -77,7 +78,7 @@ def test_nothing_pairs(tmp_path):
     [('rgbd_dataset_freiburg1_xyz', '1'), ('rgbd_dataset_freiburg2_desk', '2'), ('tum_fr3_office', '3')],
 )
 def test_known_camera_by_folder_name(tmp_path, name, number):
-    sequence = TumSequence(write_tum(tmp_path / name, [1.0], [1.0], camera=None))
+    sequence = tum.read(write_tum(tmp_path / name, [1.0], [1.0], camera=None))
     assert sequence.camera == KNOWN_CAMERAS[number].pinhole
     with pytest.raises(FrameError, match='colour image is 64x48 but the camera is calibrated for 640x480'):
         sequence[0]
@@ -85,7 +86,7 @@ def test_known_camera_by_folder_name(tmp_path, name, number):
 
 def test_camera_yaml_wins_over_folder_name(tmp_path):
     folder = write_tum(tmp_path / 'freiburg1', [1.0], [1.0], camera=CAMERA_YAML + 'depth_scale: 1000\n')
-    sequence = TumSequence(folder)
+    sequence = tum.read(folder)
     assert sequence.camera.fx == 50.0
     assert sequence.depth_scale == 1000.0
     assert np.all(sequence[0].depth_m == 5.0)
@@ -94,12 +95,12 @@ def test_camera_yaml_wins_over_folder_name(tmp_path):
 @pytest.mark.parametrize('name', ['mine', 'fr10_hall', 'afr1'])
 def test_unknown_camera_says_what_to_do(tmp_path, name):
     with pytest.raises(DatasetError, match=r'camera is unknown.*put a camera\.yaml'):
-        TumSequence(write_tum(tmp_path / name, [1.0], [1.0], camera=None))
+        tum.read(write_tum(tmp_path / name, [1.0], [1.0], camera=None))
 
 
 def test_broken_camera_yaml(tmp_path):
     with pytest.raises(CameraError, match=r'camera\.yaml: missing cx, cy, fy'):
-        TumSequence(write_tum(tmp_path, [1.0], [1.0], camera='width: 64\nheight: 48\nfx: 50\n'))
+        tum.read(write_tum(tmp_path, [1.0], [1.0], camera='width: 64\nheight: 48\nfx: 50\n'))
 
 
 @pytest.mark.parametrize(
@@ -114,7 +115,7 @@ def test_broken_list(tmp_path, line, message):
     folder = write_tum(tmp_path, [1.0], [1.0])
     (folder / 'rgb.txt').write_text(line)
     with pytest.raises(DatasetError, match=message):
-        TumSequence(folder)
+        tum.read(folder)
 
 
 def test_missing_and_broken_images_say_which(tmp_path):
@@ -122,7 +123,7 @@ def test_missing_and_broken_images_say_which(tmp_path):
     (folder / 'rgb/0.png').unlink()
     (folder / 'rgb/1.png').write_bytes((folder / 'rgb/2.png').read_bytes()[:20])
     cv2.imwrite(str(folder / 'depth/2.png'), np.zeros((48, 64, 3), np.uint8))
-    sequence = TumSequence(folder)
+    sequence = tum.read(folder)
     for index, message in enumerate([r'rgb/0\.png: cannot be read', r'rgb/1\.png: is not an image', '16 bits']):
         with pytest.raises(DatasetError, match=message):
             sequence[index]
@@ -132,7 +133,7 @@ def test_broken_truth_is_an_error_not_a_missing_truth(tmp_path):
     folder = write_tum(tmp_path, [1.0], [1.0])
     (folder / 'groundtruth.txt').write_text('1.0 0 0 0\n')
     with pytest.raises(DatasetError, match=r'groundtruth\.txt:1'):
-        TumSequence(folder).ground_truth()
+        tum.read(folder).ground_truth()
 
 
 def test_real_recording(recording):
@@ -149,4 +150,4 @@ def test_real_recording(recording):
 def test_real_recording_is_the_known_camera(recording):
     folder = recording('tum_fr1_rpy')
     stated = KNOWN_CAMERAS['1']
-    assert TumSequence(folder).camera == stated.pinhole  # its camera.yaml states what the table states
+    assert tum.read(folder).camera == stated.pinhole  # its camera.yaml states what the table states

@@ -220,3 +220,44 @@ def test_kill_loses_nothing_written(tmp_path: Path) -> None:
     run = read_run(tmp_path / 'run')
     assert len(run.trajectory) == len(run.frames) == run.metrics().frames == 7
     assert run.metrics().num_gaussians is None
+
+
+def written(folder: RunFolder, *indices: int) -> RunFolder:
+    for index in indices:
+        folder.append(frame(index), result(index), 0.01)
+    return folder
+
+
+def test_a_run_begun_anew_keeps_the_one_before(tmp_path: Path) -> None:
+    folder = written(RunFolder.create(tmp_path, CONFIG, NODE), 0, 1)
+    other = load_config('quick', ['tracking.iterations=7'])
+    folder = written(folder.restarted(other), 5)
+    before, now = read_run(tmp_path / 'previous'), read_run(tmp_path)
+    assert (len(before.trajectory), len(now.trajectory)) == (2, 1)
+    assert (before.config, now.config) == (CONFIG, other)
+    assert before.description == now.description == NODE and now.camera == before.camera
+    written(folder.restarted(CONFIG), 7, 8, 9).close()  # only the last one before is kept
+    assert (len(read_run(tmp_path / 'previous').trajectory), len(read_run(tmp_path).trajectory)) == (1, 3)
+    RunFolder.create(tmp_path, CONFIG, NODE, overwrite=True).close()  # all of it is a run's
+    assert not (tmp_path / 'previous').exists()
+
+
+def test_a_run_goes_on_in_another_folder_with_all_that_was_written(tmp_path: Path) -> None:
+    first, second = tmp_path / 'a', tmp_path / 'b' / 'c'
+    second.parent.mkdir()
+    folder = written(RunFolder.create(first, CONFIG, NODE), 0, 1).moved(second)
+    written(folder, 2).close()
+    assert (len(read_run(first).frames), len(read_run(second).frames)) == (2, 3)
+    assert len(read_run(second).trajectory) == 3
+
+
+def test_a_run_does_not_move_where_something_is(tmp_path: Path) -> None:
+    folder = written(RunFolder.create(tmp_path / 'a', CONFIG, NODE), 0)
+    (tmp_path / 'b').mkdir()
+    (tmp_path / 'b' / 'thesis.tex').touch()
+    with pytest.raises(RunFolderError, match='choose another folder'):
+        folder.moved(tmp_path / 'b')
+    with pytest.raises(RunFolderError, match='cannot be written'):
+        folder.moved(tmp_path / 'b' / 'thesis.tex' / 'c')
+    written(folder, 1).close()  # and goes on where it is
+    assert len(read_run(tmp_path / 'a').trajectory) == 2

@@ -217,3 +217,15 @@ def test_calls_to_a_stopped_or_crashed_worker_are_cancelled() -> None:
 def test_refuses_senseless_arguments(queue_size: int, when_full: str) -> None:
     with pytest.raises(ValueError, match='expected'):
         SlamWorker(HeldSlam(), print, print, queue_size=queue_size, when_full=when_full)
+
+
+def test_what_comes_before_a_frame_may_change_the_slam() -> None:
+    slam, recorder, seen = HeldSlam(held=False), Recorder(), []
+    worker = SlamWorker(
+        slam, recorder.on_result, recorder.on_bad_frame, queue_size=2, when_full='block',
+        before_frame=lambda slam, frame: seen.append((slam, frame.stamp_ns, list(recorder.results))),
+    )  # fmt: skip
+    for stamp_ns in (1, 2):
+        worker.submit(frame(stamp_ns))
+    worker.stop(drain=True)
+    assert seen == [(slam, 1, []), (slam, 2, [1])]

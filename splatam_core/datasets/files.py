@@ -1,0 +1,250 @@
+"""The files datasets consist of: images, matrices, poses, numbered names. Every error names the file."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatam_core import se3
+from splatam_core.camera import CameraCalibration, CameraFile, PinholeCamera, read_camera_file
+from splatam_core.errors import CameraError, DatasetError
+
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def camera_file(folder: Path, *, may_state_axes: bool = False) -> CameraFile | None:
+    """What a folder's ``camera.yaml`` states, or None where there is none.
+
+    Raises:
+        CameraError: the file is there and cannot be used.
+    """
+    path = folder / 'camera.yaml'
+    if not path.exists():
+        return None
+    stated = read_camera_file(path)
+    if stated.pose_axes is not None and not may_state_axes:
+        raise CameraError(f'{path}: pose_axes is for plain folders (--format folder); the axes of this one are known')
+    return stated
+
+
+def camera_of(folder: Path, otherwise: Callable[[], CameraCalibration], depth_scale: float) -> CameraFile:
+    """The camera that a folder's ``camera.yaml`` states, else the dataset's own.
+
+    Args:
+        folder: where the file may be.
+        otherwise: tells the camera where there is no such file.
+        depth_scale: counts per metre where the file does not say.
+
+    Raises:
+        CameraError: the file is there and cannot be used.
+        DatasetError: the dataset's own camera cannot be read.
+    """
+    stated = camera_file(folder)
+    if stated is None:
+        return CameraFile(otherwise(), depth_scale)
+    return CameraFile(stated.calibration, stated.depth_scale or depth_scale)
+
+
+def calibration_from_matrix(K: NDArray[np.float64], size: tuple[int, int]) -> CameraCalibration:
+    """An ideal camera from its intrinsic matrix, 3x3 or larger, and its images' width and height."""
+    return CameraCalibration(PinholeCamera(*size, *(float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))))
+
+
+def numbered(folder: Path, pattern: str) -> dict[int, Path]:
+    """Files of a folder by the number in their names, in its order.
+
+    Args:
+        folder: need not exist.
+        pattern: regular expression of the whole name; its group is the number. Of several files with
+            one number, the last by name counts (``.png`` before ``.jpg``).
+    """
+    paths = sorted(folder.iterdir()) if folder.is_dir() else []
+    found = {int(match.group(1)): path for path in paths if (match := re.fullmatch(pattern, path.name))}
+    return dict(sorted(found.items()))
+
+
+# --- images ---
+
+
+def read_color(path: Path) -> NDArray[np.uint8]:
+    """Read a colour image file as RGB, [H, W, 3].
+
+    Raises:
+        DatasetError: the file is missing or no image.
+    """
+    image = _read_image(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def read_depth_counts(path: Path) -> NDArray[np.uint16]:
+    """Read a 16-bit depth image file, [H, W] counts.
+
+    Raises:
+        DatasetError: the file is missing, no image, or not one channel of 16 bits.
+    """
+    counts = _read_image(path, cv2.IMREAD_UNCHANGED)
+    if counts.dtype != np.uint16 or counts.ndim != 2:
+        raise DatasetError(f'{path}: depth must be one channel of 16 bits, got {counts.dtype} {counts.shape}')
+    return counts
+
+
+def read_exr(path: Path) -> NDArray[np.float32]:
+    """Read the first channel (of R, Y, Z, in this order) of an OpenEXR image, [H, W].
+
+    Raises:
+        DatasetError: the file cannot be read, has none of these channels, or OpenEXR is not installed.
+    """
+    try:
+        import OpenEXR  # a dependency of this format alone
+    except ImportError:
+        raise DatasetError(f"{path}: reading EXR needs OpenEXR: pip install 'splatam_ros[exr]'") from None
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
+    except (OSError, RuntimeError, ValueError, TypeError) as error:
+        raise DatasetError(f'{path}: cannot be read as OpenEXR: {error}') from None
+    for name in ('R', 'Y', 'Z'):
+        if name in channels:
+            return channels[name]
+    raise DatasetError(f'{path}: no channel R, Y or Z for depth; it has {", ".join(channels) or "none"}')
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file.
+
+    Raises:
+        DatasetError: the file is missing or no image.
+    """
+    height, width = _read_image(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION).shape[:2]
+    return width, height
+
+
+def _read_image(path: Path, flags: int) -> NDArray[Any]:
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise DatasetError(f'{path}: cannot be read: {error.strerror}') from None
+    image = cv2.imdecode(data, flags) if data.size else None
+    if image is None:
+        raise DatasetError(f'{path}: is not an image that OpenCV can read ({data.size} bytes); is the copy complete?')
+    return image
+
+
+# --- numbers ---
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        DatasetError: the file cannot be read, or is no object.
+    """
+    try:
+        values = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise DatasetError(f'{path}: cannot be read as JSON: {error}') from None
+    if not isinstance(values, dict):
+        raise DatasetError(f'{path}: expected a JSON object, got {type(values).__name__}')
+    return values
+
+
+@contextmanager
+def parsing(path: Path) -> Iterator[None]:
+    """What is taken out of a file inside this block is missing or of the wrong kind: one error that says so."""
+    try:
+        yield
+    except KeyError as error:
+        raise DatasetError(f'{path}: {error} is missing') from None
+    except (TypeError, ValueError, IndexError, AttributeError) as error:
+        raise DatasetError(f'{path}: is not as expected: {error}') from None
+
+
+def read_numbers(path: Path) -> NDArray[np.float64]:
+    """Read all numbers of a text or ``.npy`` file, [N]; -inf, inf and nan are numbers.
+
+    Raises:
+        DatasetError: the file cannot be read, or holds something else.
+    """
+    try:
+        if path.suffix == '.npy':
+            return np.load(path, allow_pickle=False).astype(np.float64).reshape(-1)
+        return np.array(path.read_text().split(), dtype=np.float64)
+    except (OSError, ValueError, EOFError) as error:
+        raise DatasetError(f'{path}: cannot be read: {error}') from None
+
+
+def read_matrix(path: Path, *sizes: int) -> NDArray[np.float64]:
+    """Read a square matrix of finite numbers, in rows.
+
+    Args:
+        path: a text or ``.npy`` file.
+        sizes: the sizes allowed.
+
+    Raises:
+        DatasetError: the file cannot be read, or holds anything else.
+    """
+    values = read_numbers(path)
+    for size in sizes:
+        if values.size == size * size and np.isfinite(values).all():
+            return values.reshape(size, size)
+    allowed = ' or '.join(f'{size}x{size}' for size in sizes)
+    raise DatasetError(f'{path}: expected {allowed} finite numbers, got {values.size} numbers')
+
+
+# --- poses ---
+
+
+def pose(values: NDArray[np.float64], where: str) -> NDArray[np.float64] | None:
+    """A pose, its rotation made exact again where the file rounds it.
+
+    Args:
+        values: 16 numbers of a 4x4 matrix, or the 12 of its upper rows.
+        where: what to call it in an error.
+
+    Returns:
+        [4, 4]; None where a number is infinite or nan, the datasets' way to say that it is not known.
+
+    Raises:
+        DatasetError: there are other than 12 or 16 numbers, or the upper left 3x3 is no rotation.
+    """
+    values = np.asarray(values, np.float64).reshape(-1)
+    if values.size not in (12, 16):
+        raise DatasetError(f'{where}: expected the 16 numbers of a 4x4 camera-to-world matrix, got {values.size}')
+    if not np.isfinite(values).all():
+        return None
+    R, t = (T := values[:12].reshape(3, 4))[:, :3], T[:, 3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
+        raise DatasetError(f'{where}: its upper left 3x3 is no rotation; expected a 4x4 camera-to-world matrix')
+    return se3.compose(se3.quaternion_from_rotation(R), t)
+
+
+def read_pose(path: Path) -> NDArray[np.float64] | None:
+    """Read one pose file; see ``pose``."""
+    return pose(read_numbers(path), str(path))
+
+
+def read_pose_rows(path: Path) -> list[NDArray[np.float64] | None]:
+    """Read a file with the 12 or 16 numbers of one pose in each line.
+
+    Raises:
+        DatasetError: the file cannot be read, or a line is no pose.
+    """
+    try:
+        lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
+        rows = [np.array(line, dtype=np.float64) for line in lines]
+    except (OSError, ValueError) as error:
+        raise DatasetError(f'{path}: cannot be read: {error}') from None
+    return [pose(row, f'{path}, pose {number}') for number, row in enumerate(rows)]
+
+
+def from_opengl(T_world_cam: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    """The same pose with the camera's axes x right, y down, z forward instead of x right, y up, z backward."""
+    return None if T_world_cam is None else T_world_cam @ OPENCV_FROM_OPENGL

@@ -1,0 +1,89 @@
+"""ICL-NUIM recordings, the TUM-compatible PNGs.
+
+::
+
+    living_room_traj2_frei_png/
+        associations.txt            # or:
+        livingRoom2.gt.freiburg     # frame tx ty tz qx qy qz qw, camera to world, y up; may be missing
+        rgb/0.png
+        depth/0.png                 # 16 bit, 5000 counts per metre, along the axis; 0 = no reading
+        camera.yaml                 # may be missing: then 640x480, f 481.2 480, c 319.5 239.5
+
+Layout: doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html. The poses are of POV-Ray's left-handed world and camera, y up, while
+the rows of these images run down: they are mirrored here, T' = F T F with F = diag(1, -1, 1, 1), and fy is +480 (-480
+belongs to the POV-Ray files, which are not read; cuVSLAM's converter found the same, nvidia-isaac/cuVSLAM #135).
+Truth is read by the frame numbers it states: frame 0, and in the office 1, have none. ``.gt.sim`` states no numbers
+and is not read. The first frame is at 1 s, and the numbers in the names count at 30 Hz.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatam_core import se3
+from splatam_core.camera import CameraCalibration, PinholeCamera
+from splatam_core.datasets import base, files
+from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
+from splatam_core.errors import DatasetError
+from splatam_core.types import Trajectory
+
+CAMERA = CameraCalibration(PinholeCamera(640, 480, 481.2, 480.0, 319.5, 239.5))
+DEPTH_SCALE = 5000.0
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+def read(folder: Path, *, width: int | None = None) -> ImagePairs:
+    """List the frames of a folder.
+
+    Raises:
+        DatasetError: there are no frames, or one lacks its depth.
+        CameraError: ``camera.yaml`` cannot be used.
+    """
+    color = files.numbered(folder / 'rgb', r'(\d+)\.png')
+    pairs = pair_up(color, files.numbered(folder / 'depth', r'(\d+)\.png'), folder, 'rgb/0.png with depth/0.png')
+    camera = files.camera_of(folder, lambda: CAMERA, DEPTH_SCALE)
+
+    def truth() -> Trajectory | None:
+        poses = _poses(folder)
+        return trajectory(pairs, [poses.get(number) for number in color])
+
+    return ImagePairs(
+        folder.resolve().name, pairs, camera.calibration, DepthFormat(camera.depth_scale), width=width, truth=truth
+    )
+
+
+def _poses(folder: Path) -> dict[int, NDArray[np.float64]]:
+    """Pose of each frame number that has one."""
+    paths = sorted(folder.glob('*.gt.freiburg'))
+    if len(paths) > 1:
+        raise DatasetError(f'{folder}: holds {", ".join(path.name for path in paths)}; keep the one that belongs to it')
+    if not paths:
+        return {}
+    numbers = files.read_numbers(paths[0])
+    if numbers.size % 8 or not np.isfinite(numbers).all():
+        raise DatasetError(
+            f"{paths[0]}: expected 'frame tx ty tz qx qy qz qw' in each line, got {numbers.size} numbers"
+        )
+    rows = numbers.reshape(-1, 8)
+    if not np.linalg.norm(rows[:, 4:], axis=1).all():
+        raise DatasetError(f'{paths[0]}: a quaternion is zero')
+    T = MIRROR @ se3.compose(rows[:, [7, 4, 5, 6]], rows[:, 1:4]) @ MIRROR
+    return dict(zip(rows[:, 0].astype(int).tolist(), T, strict=True))
+
+
+def _recognises(source: str) -> bool:
+    folder = Path(source)
+    stated = (folder / 'associations.txt').is_file() or any(folder.glob('*.gt.freiburg'))
+    return stated and (folder / 'rgb').is_dir() and (folder / 'depth').is_dir() and not (folder / 'rgb.txt').exists()
+
+
+def _open(source: str, options: base.ReadOptions) -> ImagePairs:
+    return read(Path(source), width=options.width)
+
+
+FORMAT = base.Format(
+    'icl', 'a folder with rgb/, depth/, and associations.txt or a .gt.freiburg file', _recognises, _open
+)

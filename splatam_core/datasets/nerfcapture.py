@@ -1,0 +1,105 @@
+"""NeRFCapture recordings (iPhone and iPad), as SplaTAM's capture script saves them.
+
+::
+
+    my_capture/
+        transforms.json         # fl_x fl_y cx cy w h integer_depth_scale, and frames: file_path depth_path
+                                #   transform_matrix, with fl_x ... of their own
+        rgb/0.png
+        depth/0.png             # 16 bit, integer_depth_scale metres a count (10/65535), 0 = no reading
+        camera.yaml             # may be missing; wins over the cameras in transforms.json
+
+Layout: ``scripts/nerfcapture2dataset.py`` (github.com/spla-tam/SplaTAM) and instant-ngp's ``nerfcapture2nerf.py``.
+Poses are ARKit's, with OpenGL's camera axes. Each frame has a camera of its own, for the lens focuses: frames are
+rectified to the first one's. Frames without depth are left out. There are no stamps: frames come at 30 Hz, the first
+at 1 s.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatam_core.camera import CameraCalibration
+from splatam_core.datasets import base, files, nerfstudio
+from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
+from splatam_core.errors import DatasetError
+
+METRES_PER_COUNT = 10 / 65535
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _Capture:
+    """What ``transforms.json`` says about the frames that have depth, by their position."""
+
+    calibration: CameraCalibration
+    color: dict[int, Path]
+    depth: dict[int, Path]
+    calibrations: dict[int, CameraCalibration]
+    poses: list[NDArray[np.float64] | None]
+    depth_scale: float
+
+
+def read(folder: Path, *, width: int | None = None) -> ImagePairs:
+    """Read the list of frames.
+
+    Raises:
+        DatasetError: ``transforms.json`` cannot be used, or states no frame with depth.
+        CameraError: a camera cannot be used.
+    """
+    capture = _read_transforms(folder)
+    has_file = (folder / 'camera.yaml').exists()
+    pairs = pair_up(
+        capture.color, capture.depth, folder, 'rgb/0.png with depth/0.png in transforms.json',
+        calibrations=None if has_file else capture.calibrations,
+    )  # fmt: skip
+    camera = files.camera_of(folder, lambda: capture.calibration, capture.depth_scale)
+    return ImagePairs(
+        folder.resolve().name, pairs, camera.calibration, DepthFormat(camera.depth_scale),
+        width=width, truth=lambda: trajectory(pairs, capture.poses),
+    )  # fmt: skip
+
+
+def _read_transforms(folder: Path) -> _Capture:
+    path = folder / 'transforms.json'
+    values = files.read_json(path)
+    with files.parsing(path):
+        frames = [frame for frame in values['frames'] if frame.get('depth_path')]
+        if len(frames) < len(values['frames']):
+            _log.warning('%s: %d frames have no depth_path', path, len(values['frames']) - len(frames))
+        if not frames:
+            raise DatasetError(f'{path}: none of {len(values["frames"])} frames has a depth_path')
+        cameras = [nerfstudio.calibration({**values, **frame}) for frame in frames]
+        return _Capture(
+            cameras[0],
+            {index: _image(folder, frame['file_path']) for index, frame in enumerate(frames)},
+            {index: _image(folder, frame['depth_path']) for index, frame in enumerate(frames)},
+            dict(enumerate(cameras)),
+            [nerfstudio.pose(frame, f'{path}, frame {index}') for index, frame in enumerate(frames)],
+            1 / float(values.get('integer_depth_scale', METRES_PER_COUNT)),
+        )
+
+
+def _image(folder: Path, name: Any) -> Path:
+    """The file that a path in the list means; NeRFCapture's own lists leave the suffix out."""
+    path = folder / str(name)
+    return path if path.suffix else path.with_suffix('.png')
+
+
+def _recognises(source: str) -> bool:
+    folder = Path(source)
+    return (folder / 'transforms.json').is_file() and (folder / 'depth').is_dir()
+
+
+def _open(source: str, options: base.ReadOptions) -> ImagePairs:
+    return read(Path(source), width=options.width)
+
+
+FORMAT = base.Format('nerfcapture', 'a folder with transforms.json, rgb/ and depth/', _recognises, _open)
