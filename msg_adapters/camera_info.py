@@ -6,6 +6,7 @@ A pixel's centre is its integer index: cropping subtracts the offset, binning by
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -44,18 +45,24 @@ class CameraParameters:
     frame_id: str = ''
 
 
-def parameters(message: Any) -> CameraParameters:
+def parameters(message: Any, *, is_rectified: bool = False) -> CameraParameters:
     """Read a ``sensor_msgs/CameraInfo``; K and D are used, binning and region of interest applied.
+
+    Of images that are rectified already (``image_rect``), P is the camera; K and D are what it was before.
 
     A model whose coefficients are all zero is 'none'. That holds for 'equidistant' too: an info like
     that comes with rectified images, no calibration finds exact zeros.
 
+    Args:
+        message: the CameraInfo.
+        is_rectified: whether the images it comes with are rectified.
+
     Raises:
-        MessageError: K is not calibrated, the size is zero, the distortion model is unknown or has too
-            many coefficients, or the region of interest is not within the image.
+        MessageError: K, or the P of rectified images, is not calibrated, the size is zero, the distortion model is
+            unknown or has too many coefficients, or the region of interest is not within the image.
     """
-    fx, cx, fy, cy = _intrinsics(message)
-    model, coefficients = _distortion(message)
+    fx, cx, fy, cy = _intrinsics('P', message.p, 4) if is_rectified else _intrinsics('K', message.k, 3)
+    model, coefficients = ('none', ()) if is_rectified else _distortion(message)
     full = CameraParameters(
         int(message.width), int(message.height), fx, fy, cx, cy, model, coefficients, message.header.frame_id
     )
@@ -64,14 +71,16 @@ def parameters(message: Any) -> CameraParameters:
     return _binned(_cropped(full, message.roi), int(message.binning_x), int(message.binning_y))
 
 
-def _intrinsics(message: Any) -> tuple[float, float, float, float]:
-    k = [float(value) for value in message.k]
-    if not (np.isfinite(k).all() and k[0] > 0 and k[4] > 0):
+def _intrinsics(name: str, matrix: Sequence[float], columns: int) -> tuple[float, float, float, float]:
+    """fx, cx, fy, cy of a matrix given row by row."""
+    values = [float(value) for value in matrix]
+    fx, cx, fy, cy = values[0], values[2], values[columns + 1], values[columns + 2]
+    if not (np.isfinite(values).all() and fx > 0 and fy > 0):
         raise MessageError(
-            f'CameraInfo K = {k}: focal lengths must be positive and all values finite; '
+            f'CameraInfo {name} = {values}: focal lengths must be positive and all values finite; '
             'the camera is not calibrated, or its driver does not publish the calibration'
         )
-    return k[0], k[2], k[4], k[5]
+    return fx, cx, fy, cy
 
 
 def _distortion(message: Any) -> tuple[str, tuple[float, ...]]:

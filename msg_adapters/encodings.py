@@ -44,7 +44,9 @@ def clean_metres(depth_m: NDArray[np.floating[Any]]) -> Depth:
     """A copy with 0 wherever there is no reading: NaN, inf, negative."""
     with np.errstate(over='ignore'):  # beyond float32 is inf, and no reading either
         depth_m = depth_m.astype(np.float32, copy=False)
-    return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(0))
+    clean = np.zeros(depth_m.shape, np.float32)
+    np.copyto(clean, depth_m, where=(depth_m > 0) & (depth_m < np.inf))
+    return clean
 
 
 def _converted(code: int, image: Rgb) -> Rgb:

@@ -1,10 +1,12 @@
 """Coloured points to and from ``sensor_msgs/PointCloud2``.
 
 The fields are ``x y z rgb``, all FLOAT32; rgb holds the bits 0x00RRGGBB, as RViz expects.
+More FLOAT32 fields may follow.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,12 +19,12 @@ from msg_adapters.factory import MessageFactory
 _FLOAT32 = 7
 _UINT32 = 6
 _FIELDS = ('x', 'y', 'z', 'rgb')
-_POINT_STEP = 16
 
 
 def cloud_message(
-    factory: MessageFactory, points: NDArray[np.float32], rgb: NDArray[np.uint8], stamp_ns: int, frame_id: str
-) -> Any:
+    factory: MessageFactory, points: NDArray[np.float32], rgb: NDArray[np.uint8], stamp_ns: int, frame_id: str,
+    extra: Mapping[str, NDArray[np.float32]] | None = None,
+) -> Any:  # fmt: skip
     """An unorganised ``sensor_msgs/PointCloud2``.
 
     Args:
@@ -31,15 +33,21 @@ def cloud_message(
         rgb: [N, 3] uint8.
         stamp_ns: stamp of the header.
         frame_id: frame the points are in.
+        extra: further fields by name, [N] float32 each.
 
     Raises:
         MessageError: the arrays have other shapes or types.
     """
+    extra = extra or {}
     if points.shape != (len(points), 3) or rgb.shape != points.shape or rgb.dtype != np.uint8:
         raise MessageError(
             f'points have shape {points.shape}, rgb has shape {rgb.shape} and type {rgb.dtype}; '
             'expected [N, 3] metres and [N, 3] uint8'
         )
+    wrong = [f'{name} has shape {values.shape}' for name, values in extra.items() if values.shape != points.shape[:1]]
+    if wrong:
+        raise MessageError(f'{", ".join(wrong)}; expected one value for each of the {len(points)} points')
+    data = _packed(points, rgb, list(extra.values()))
     return factory.make(
         'sensor_msgs/msg/PointCloud2',
         header=stamps.header(factory, stamp_ns, frame_id),
@@ -47,20 +55,24 @@ def cloud_message(
         width=len(points),
         fields=[
             factory.make('sensor_msgs/msg/PointField', name=name, offset=4 * i, datatype=_FLOAT32, count=1)
-            for i, name in enumerate(_FIELDS)
+            for i, name in enumerate((*_FIELDS, *extra))
         ],
         is_bigendian=False,
-        point_step=_POINT_STEP,
-        row_step=_POINT_STEP * len(points),
-        data=_packed(points, rgb).reshape(-1),
+        point_step=data.shape[1],
+        row_step=data.size,
+        data=data.reshape(-1),
         is_dense=bool(np.isfinite(points).all()),
     )
 
 
-def _packed(points: NDArray[np.float32], rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    data = np.zeros((len(points), _POINT_STEP), np.uint8)
+def _packed(
+    points: NDArray[np.float32], rgb: NDArray[np.uint8], extra: Sequence[NDArray[np.float32]]
+) -> NDArray[np.uint8]:
+    data = np.zeros((len(points), 4 * (len(_FIELDS) + len(extra))), np.uint8)
     data[:, :12].view('<f4')[:] = points
     data[:, 12:15] = rgb[:, ::-1]
+    for i, values in enumerate(extra):
+        data[:, 16 + 4 * i : 20 + 4 * i].view('<f4')[:, 0] = values
     return data
 
 

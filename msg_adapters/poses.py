@@ -21,14 +21,26 @@ def pose_matrix(pose: Any) -> Matrix:
     Raises:
         MessageError: a number is not finite, or the quaternion is zero.
     """
-    p, q = pose.position, pose.orientation
+    return _matrix('pose', pose.position, pose.orientation)
+
+
+def transform_matrix(transform: Any) -> Matrix:
+    """[4, 4] of a ``geometry_msgs/Transform``; its quaternion may have any length but zero.
+
+    Raises:
+        MessageError: a number is not finite, or the quaternion is zero.
+    """
+    return _matrix('transform', transform.translation, transform.rotation)
+
+
+def _matrix(what: str, p: Any, q: Any) -> Matrix:
     xyzw = np.array([q.x, q.y, q.z, q.w], dtype=np.float64)
     T = np.eye(4)
     T[:3, 3] = p.x, p.y, p.z
     length = np.linalg.norm(xyzw)
     if not (np.isfinite(T).all() and np.isfinite(length) and length > 0):
         raise MessageError(
-            f'pose with position {T[:3, 3].tolist()} and quaternion xyzw {xyzw.tolist()}: '
+            f'{what} with position {T[:3, 3].tolist()} and quaternion xyzw {xyzw.tolist()}: '
             'all must be finite, and the quaternion not zero'
         )
     T[:3, :3] = _rotation(xyzw / length)
@@ -37,11 +49,8 @@ def pose_matrix(pose: Any) -> Matrix:
 
 def pose_message(factory: MessageFactory, T: Matrix) -> Any:
     """A ``geometry_msgs/Pose`` of a [4, 4] rigid motion; the quaternion has w >= 0."""
-    x, y, z, w = quaternion_xyzw(T[:3, :3])
     return factory.make(
-        'geometry_msgs/msg/Pose',
-        position=factory.make('geometry_msgs/msg/Point', x=float(T[0, 3]), y=float(T[1, 3]), z=float(T[2, 3])),
-        orientation=factory.make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w),
+        'geometry_msgs/msg/Pose', position=_xyz(factory, 'Point', T[:3, 3]), orientation=_quaternion(factory, T)
     )
 
 
@@ -54,27 +63,63 @@ def pose_stamped(factory: MessageFactory, T: Matrix, stamp_ns: int, frame_id: st
     )
 
 
-def odometry(factory: MessageFactory, T: Matrix, stamp_ns: int, frame_id: str, child_frame_id: str) -> Any:
-    """A ``nav_msgs/Odometry`` of the [4, 4] pose of ``child_frame_id`` in ``frame_id``; no twist, no covariances."""
-    unknown = np.zeros(36)
-    still = [factory.make('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0) for _ in range(2)]
-    twist = factory.make('geometry_msgs/msg/Twist', linear=still[0], angular=still[1])
+def odometry(
+    factory: MessageFactory, T: Matrix, stamp_ns: int, frame_id: str, child_frame_id: str, *,
+    pose_covariance: Matrix, twist: NDArray[np.float64], twist_covariance: Matrix,
+) -> Any:  # fmt: skip
+    """A ``nav_msgs/Odometry`` of the [4, 4] pose of ``child_frame_id`` in ``frame_id``.
+
+    Args:
+        factory: who makes the message.
+        T: [4, 4] pose.
+        stamp_ns: stamp of the header.
+        frame_id: frame the pose is in.
+        child_frame_id: frame the pose is of.
+        pose_covariance: [6, 6] of x y z and the rotations about x y z, in the axes of ``frame_id``.
+        twist: [6] linear and angular velocity, in the axes of ``child_frame_id``.
+        twist_covariance: [6, 6] of it.
+    """
+    linear, angular = (_xyz(factory, 'Vector3', vector) for vector in (twist[:3], twist[3:]))
     return factory.make(
         'nav_msgs/msg/Odometry',
         header=stamps.header(factory, stamp_ns, frame_id),
         child_frame_id=child_frame_id,
-        pose=factory.make('geometry_msgs/msg/PoseWithCovariance', pose=pose_message(factory, T), covariance=unknown),
-        twist=factory.make('geometry_msgs/msg/TwistWithCovariance', twist=twist, covariance=unknown),
+        pose=factory.make(
+            'geometry_msgs/msg/PoseWithCovariance',
+            pose=pose_message(factory, T), covariance=np.ravel(pose_covariance),
+        ),
+        twist=factory.make(
+            'geometry_msgs/msg/TwistWithCovariance',
+            twist=factory.make('geometry_msgs/msg/Twist', linear=linear, angular=angular),
+            covariance=np.ravel(twist_covariance),
+        ),
+    )  # fmt: skip
+
+
+def path(factory: MessageFactory, poses: Sequence[Any], stamp_ns: int, frame_id: str) -> Any:
+    """A ``nav_msgs/Path`` of ``geometry_msgs/PoseStamped``, each with its own stamp."""
+    return factory.make('nav_msgs/msg/Path', header=stamps.header(factory, stamp_ns, frame_id), poses=list(poses))
+
+
+def transform_stamped(factory: MessageFactory, T: Matrix, stamp_ns: int, frame_id: str, child_frame_id: str) -> Any:
+    """A ``geometry_msgs/TransformStamped``: the [4, 4] pose of ``child_frame_id`` in ``frame_id``."""
+    transform = factory.make(
+        'geometry_msgs/msg/Transform', translation=_xyz(factory, 'Vector3', T[:3, 3]), rotation=_quaternion(factory, T)
     )
-
-
-def path(factory: MessageFactory, trajectory: Sequence[tuple[int, Matrix]], stamp_ns: int, frame_id: str) -> Any:
-    """A ``nav_msgs/Path`` of (stamp_ns, [4, 4]) poses, each with its own stamp."""
     return factory.make(
-        'nav_msgs/msg/Path',
-        header=stamps.header(factory, stamp_ns, frame_id),
-        poses=[pose_stamped(factory, T, pose_stamp_ns, frame_id) for pose_stamp_ns, T in trajectory],
-    )
+        'geometry_msgs/msg/TransformStamped',
+        header=stamps.header(factory, stamp_ns, frame_id), child_frame_id=child_frame_id, transform=transform,
+    )  # fmt: skip
+
+
+def _xyz(factory: MessageFactory, name: str, vector: NDArray[np.float64]) -> Any:
+    x, y, z = (float(value) for value in vector)
+    return factory.make(f'geometry_msgs/msg/{name}', x=x, y=y, z=z)
+
+
+def _quaternion(factory: MessageFactory, T: Matrix) -> Any:
+    x, y, z, w = quaternion_xyzw(T[:3, :3])
+    return factory.make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w)
 
 
 def quaternion_xyzw(R: Matrix) -> tuple[float, float, float, float]:

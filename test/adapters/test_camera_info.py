@@ -156,3 +156,16 @@ def test_a_region_outside_the_image_is_an_error(info, roi):
 def test_binning_that_leaves_nothing_is_an_error(info):
     with pytest.raises(MessageError, match='binning'):
         parameters(info(binning_x=641))
+
+
+def test_the_camera_of_rectified_images_is_p(info):
+    """An image_rect topic: D is the lens's still, but the images are bent straight already, to P."""
+    message = info(d=[0.1, -0.2, 0.0, 0.0, 0.0], p=[400.0, 0.0, 310.0, 0.0, 0.0, 410.0, 230.0, 0.0, 0.0, 0.0, 1.0, 0.0], binning_x=2)
+    camera = parameters(message, is_rectified=True)
+    assert (camera.distortion_model, camera.distortion) == ('none', ())
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (200.0, 410.0, 310.5 / 2 - 0.5, 230.0)
+
+
+def test_rectified_images_without_p_are_an_error(info):
+    with pytest.raises(MessageError, match='CameraInfo P .* focal lengths must be positive'):
+        parameters(info(p=[0.0] * 12), is_rectified=True)

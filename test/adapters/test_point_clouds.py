@@ -39,6 +39,25 @@ def test_colour_is_packed_as_rviz_unpacks_it(factory):
     assert struct.unpack_from('<I', bytes(message.data), 12) == (0x112233,)
 
 
+def test_more_fields_follow_as_float32(factory):
+    points, rgb = random_cloud(3)
+    extra = {'opacity': np.float32([0.1, 0.2, 0.3]), 'radius': np.float32([1, 2, 3])}
+    message = cloud_message(factory, points, rgb, 0, 'map', extra)
+    assert [(field.name, field.offset, field.datatype, field.count) for field in message.fields[4:]] == [
+        ('opacity', 16, FLOAT32, 1), ('radius', 20, FLOAT32, 1)
+    ]  # fmt: skip
+    assert (message.point_step, message.row_step) == (24, 72)
+    records = np.frombuffer(bytes(message.data), '<f4').reshape(3, 6)
+    assert_array_equal(records[:, 4:], np.stack([*extra.values()], axis=-1))
+    assert_array_equal(read_cloud(message)[0], points)
+    assert_array_equal(read_cloud(message)[1], rgb)
+
+
+def test_a_field_of_another_length_is_not_sent(factory):
+    with pytest.raises(MessageError, match=r'radius has shape \(2,\); expected one value for each of the 3 points'):
+        cloud_message(factory, *random_cloud(3), 0, 'map', {'radius': np.zeros(2, np.float32)})
+
+
 @pytest.mark.parametrize(('value', 'is_dense'), [(1.0, True), (np.nan, False), (np.inf, False)])
 def test_points_that_are_not_finite_are_said(factory, value, is_dense):
     points = np.array([[0, 0, value]], np.float32)
