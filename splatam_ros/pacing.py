@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -22,9 +23,23 @@ class PlaybackClock:
             rate: recording seconds in a wall second; None = as fast as messages can be handed out.
         """
         self._rate = rate
+        self._freezes = 0
+        self.restart(start_ns)
+
+    @property
+    def rate(self) -> float | None:
+        """Recording seconds in a wall second; None = as fast as messages can be handed out."""
+        return self._rate
+
+    @rate.setter
+    def rate(self, rate: float | None) -> None:
+        self.restart(self.now_ns())
+        self._rate = rate
+
+    def restart(self, start_ns: int) -> None:
+        """Go to some recording time."""
         self._anchor_ns = start_ns
         self._anchor_s = time.monotonic()
-        self._freezes = 0
 
     def now_ns(self) -> int:
         """Recording time now."""
@@ -37,9 +52,9 @@ class PlaybackClock:
         return 0.0 if self._rate is None else (time_ns - self.now_ns()) / (self._rate * 1e9)
 
     def published(self, time_ns: int) -> None:
-        """Tell the clock which message went out; without a rate that is what time it is."""
-        if self._rate is None:
-            self._anchor_ns = time_ns
+        """Tell the clock which message went out; where time does not run by itself, that is what time it is."""
+        if self._rate is None or self._freezes:
+            self._anchor_ns = max(self._anchor_ns, time_ns)
 
     def freeze(self) -> None:
         """Stop; undone by as many calls of ``thaw``."""
@@ -59,6 +74,25 @@ class PlaybackClock:
             yield
         finally:
             self.thaw()
+
+
+class Lateness:
+    """How late messages went out, by the wall clock, the last of them."""
+
+    KEPT = 100_000
+
+    def __init__(self) -> None:
+        self._late_s: deque[float] = deque(maxlen=self.KEPT)
+
+    def add(self, seconds: float) -> None:
+        """Of one message."""
+        self._late_s.append(max(0.0, seconds))
+
+    @property
+    def p95_ms(self) -> float | None:
+        """What 95 % of the messages keep to, milliseconds; None before the first."""
+        late_s = sorted(self._late_s)
+        return 1e3 * late_s[math.ceil(0.95 * len(late_s)) - 1] if late_s else None
 
 
 @dataclass(slots=True)

@@ -3,31 +3,32 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Generator
+from contextlib import closing
 
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rosgraph_msgs.msg import Clock
 from tqdm import tqdm
 
-from msg_adapters import stamps
 from splatam_core.errors import SplatamError
+from splatam_ros.controls import Controls
 from splatam_ros.keyboard import Keyboard
 from splatam_ros.listeners import Answers, Listeners
-from splatam_ros.pacing import Backlog, PlaybackClock
+from splatam_ros.offered_qos import publisher_qos
+from splatam_ros.pacing import Backlog, Lateness, PlaybackClock
+from splatam_ros.playback_options import Options
 from splatam_ros.process import RosError, StopRequest
+from splatam_ros.read_ahead import ReadAhead
 from splatam_ros.recording import CAMERA_INFO, RawMessage, RecordedTopic, Recording, stamp_of
+from splatam_ros.sim_clock import SimClock
 
 STEP_S = 0.05  # longest time without a look at keys, signals and the graph
 LOOK_AROUND_S = 0.2
 LATE_SUBSCRIBERS_S = 5.0  # after the first image topic is heard; discovery takes up to 3 s
 QUIET_S = 3.0  # without an answer, before the player says what it waits for
 IN_FLIGHT = 8  # frames ahead of the transport's acknowledgements, where no topic answers
-IMAGE_DEPTH, OTHER_DEPTH = 50, 1000  # messages kept until they are acknowledged
 
 
 class PlaybackError(SplatamError):
@@ -38,39 +39,8 @@ class Interrupted(Exception):
     """A signal asked the player to stop."""
 
 
-@dataclass(frozen=True, slots=True)
-class Options:
-    """How to play.
-
-    Attributes:
-        topics: names of the topics to play, as recorded.
-        remap: from recorded names to names on the graph.
-        rate: recording seconds in a wall second; None = as fast as the listeners allow.
-        start_offset_s: recording time to leave out at the beginning.
-        duration_s: recording time to play; None = to the end.
-        loop: start over at the end.
-        clock_hz: how often to publish ``/clock``; None = not at all.
-        start_paused: wait for the space key before the first message.
-        wait_for: the topics that answer frames: the first must come up, the others may. Empty = the transport.
-        max_ahead: frames handed out beyond the newest answer.
-        wait_timeout_s: longest wait for an answer.
-        wait_for_subscribers: wait until the images are subscribed to, and stop when they no longer are.
-        discovery_timeout_s: longest wait for subscribers and for the answering topic.
-    """
-
-    topics: tuple[str, ...]
-    remap: dict[str, str]
-    rate: float | None
-    start_offset_s: float
-    duration_s: float | None
-    loop: bool
-    clock_hz: float | None
-    start_paused: bool
-    wait_for: tuple[str, ...]
-    max_ahead: int
-    wait_timeout_s: float
-    wait_for_subscribers: bool
-    discovery_timeout_s: float
+class _Stopped(Exception):
+    """A service asked the player to stop."""
 
 
 class Player:
@@ -86,32 +56,27 @@ class Player:
             recording: open.
             options: how to play.
             stop: ends playback when requested.
-            keyboard: its space key pauses.
+            keyboard: steers playback too.
         """
         self._node = node
         self._recording = recording
         self._options = options
         self._stop = stop
-        self._keyboard = keyboard
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self._publishers = {name: self._create_publisher(recording.topics[name]) for name in options.topics}
         awaited = [self._publishers[name] for name in options.topics if _is_awaited(recording.topics[name])]
         self._listeners = Listeners(node, {publisher.topic_name: publisher for publisher in awaited})
         self._answers = [Answers(node, topic, self._answered) for topic in options.wait_for]
-        self._clock_publisher = node.create_publisher(Clock, '/clock', 10) if options.clock_hz else None
-        self._start_ns = recording.start_ns + round(options.start_offset_s * 1e9)
-        self._end_ns = recording.end_ns
-        if options.duration_s is not None:
-            self._end_ns = min(self._end_ns, self._start_ns + round(options.duration_s * 1e9))
-        self._clock = PlaybackClock(self._start_ns, options.rate)
-        self._clock.freeze()  # until the first message is due
+        self._clock = PlaybackClock(options.start_ns, options.rate)
+        self._sim_clock = SimClock(node, self._clock, options.clock_hz, options.clock_topics)
+        self._controls = Controls(node, self._clock, keyboard, self._say)
         self._color: str | None = None
         self._depth: str | None = None
         self._backlog = Backlog(needs_depth=False)
-        self._is_paused = False
+        self._lateness = Lateness()
         self._num_messages = 0
-        self._clock_due_s = self._look_around_due_s = 0.0
+        self._look_around_due_s = 0.0
         self._quiet_s = QUIET_S
         self._bar: tqdm | None = None
 
@@ -124,19 +89,18 @@ class Player:
             DatasetError: the recording breaks off.
             Interrupted: by a signal.
         """
-        self._wait_for_listeners()
-        self._choose_frames()
-        self._wait_for_answering_topic()
-        self._listeners.watch()
         started_s = time.monotonic()
-        seconds = (self._end_ns - self._start_ns) / 1e9
-        layout = '{percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s of the recording [{elapsed}<{remaining}{postfix}]'
-        with tqdm(total=seconds, bar_format=layout, disable=None, dynamic_ncols=True) as self._bar:
-            self._play_once()
-            while self._options.loop:
-                self._say('starting over')
-                self._play_once()
-            self._finish()
+        try:
+            with self._clock.frozen():
+                self._clock.restart(self._options.start_ns)
+                self._wait_for_listeners()
+                self._choose_frames()
+                self._wait_for_answering_topic()
+            self._listeners.watch()
+            started_s = time.monotonic()
+            self._play_all()
+        except _Stopped:
+            return f'stopped; {self._summary(time.monotonic() - started_s)}'
         return self._summary(time.monotonic() - started_s)
 
     @property
@@ -148,9 +112,7 @@ class Player:
         return f'{images} handed out, {missing}'
 
     def _create_publisher(self, topic: RecordedTopic) -> Publisher:
-        depth = max(topic.depth, IMAGE_DEPTH if topic.is_image else OTHER_DEPTH)
-        durability = DurabilityPolicy.TRANSIENT_LOCAL if topic.is_latched else DurabilityPolicy.VOLATILE
-        qos = QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
+        qos = publisher_qos(topic, self._options.qos.get(topic.name, {}), self._options.must_arrive)
         return self._node.create_publisher(topic.message_class, self._options.remap.get(topic.name, topic.name), qos)
 
     # --- before the first message ---
@@ -201,35 +163,73 @@ class Player:
 
     # --- playing ---
 
+    def _play_all(self) -> None:
+        seconds = (self._options.end_ns - self._options.start_ns) / 1e9
+        layout = '{percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s of the recording [{elapsed}<{remaining}{postfix}]'
+        with tqdm(total=seconds, bar_format=layout, disable=None, dynamic_ncols=True) as self._bar:
+            if self._options.start_paused:
+                self._controls.pause()
+            self._play_once()
+            while self._options.loop:
+                self._say('starting over')
+                self._play_once()
+            self._finish()
+
     def _play_once(self) -> None:
         self._backlog.restart()
-        self._clock = PlaybackClock(self._start_ns, self._options.rate)
-        self._is_paused = False
-        if self._options.start_paused and self._num_messages == 0:
-            self._toggle_pause()
+        self._sim_clock.restart()
+        self._clock.restart(self._options.start_ns)
         self._publish_latched()
-        for message in self._recording.messages(self._options.topics, self._start_ns, self._end_ns + 1):
-            self._wait_until_due(message.time_ns)
-            if message.topic == self._color:
-                self._wait_for_room()
-            self._publish(message)
+        self._rest(self._options.delay_s)
+        with closing(self._messages()) as messages:
+            for message in messages:
+                self._wait_until_due(message.time_ns)
+                if message.topic == self._color:
+                    self._wait_for_room()
+                self._publish(message)
+
+    def _rest(self, seconds: float) -> None:
+        until_s = time.monotonic() + seconds
+        with self._clock.frozen():
+            while (left_s := until_s - time.monotonic()) > 0:
+                self._step(left_s)
+
+    def _messages(self) -> Generator[RawMessage, None, None]:
+        """What is to be played, as soon as it has been read."""
+        options = self._options
+        messages = self._recording.messages(options.topics, options.start_ns, options.end_ns + 1)
+        with ReadAhead(messages, options.read_ahead) as ahead:
+            while not ahead.is_over:
+                message = ahead.take(STEP_S)
+                if message is not None:
+                    yield message
+                else:
+                    self._step(0.0)
 
     def _publish_latched(self) -> None:
         """What was latched before the start, ``/tf_static`` say, is still true at the start."""
         latched = [name for name in self._options.topics if self._recording.topics[name].is_latched]
-        for message in self._recording.messages(latched, None, self._start_ns):
+        for message in self._recording.messages(latched, None, self._options.start_ns):
             self._publishers[message.topic].publish(message.data)
 
     def _wait_until_due(self, time_ns: int) -> None:
         self._step(self._clock.seconds_until(time_ns))
-        while self._is_paused or self._clock.seconds_until(time_ns) > 0:
-            self._step(STEP_S if self._is_paused else self._clock.seconds_until(time_ns))
+        while not self._may_go(time_ns):
+            self._step(self._clock.seconds_until(time_ns) if not self._controls.is_paused else STEP_S)
+
+    def _may_go(self, time_ns: int) -> bool:
+        if self._controls.is_paused:
+            return self._controls.take_step()
+        return self._clock.seconds_until(time_ns) <= 0
 
     def _wait_for_room(self) -> None:
         limit = self._options.max_ahead if self._answers else IN_FLIGHT
         self._wait_for_answers(lambda: self._backlog.waiting < limit)
 
     def _publish(self, message: RawMessage) -> None:
+        self._sim_clock.message_due(message.topic, message.time_ns)
+        if not self._controls.is_paused:
+            self._lateness.add(-self._clock.seconds_until(message.time_ns))
         self._publishers[message.topic].publish(message.data)
         self._num_messages += 1
         self._clock.published(message.time_ns)
@@ -238,24 +238,28 @@ class Player:
         elif message.topic == self._depth:
             self._backlog.depth(stamp_of(message.data))
         if self._bar is not None:
-            self._bar.update((message.time_ns - self._start_ns) / 1e9 - self._bar.n)
+            self._bar.update((message.time_ns - self._options.start_ns) / 1e9 - self._bar.n)
 
     def _finish(self) -> None:
         """Wait until the last frame is answered and the last message has arrived."""
-        self._clock.freeze()
-        self._wait_for_answers(lambda: self._backlog.waiting == 0)
-        for publisher in self._publishers.values():
-            if not self._wait_until(lambda: _is_acknowledged(publisher), self._options.wait_timeout_s):  # noqa: B023
-                raise PlaybackError(
-                    f'a subscriber of {publisher.topic_name} has not taken all messages '
-                    f'within {self._options.wait_timeout_s:g} s'
-                )
+        with self._clock.frozen():
+            self._wait_for_answers(lambda: self._backlog.waiting == 0)
+            for publisher in self._publishers.values():
+                self._wait_for_acknowledgement(publisher)
+
+    def _wait_for_acknowledgement(self, publisher: Publisher) -> None:
+        timeout_s = self._options.acknowledge_timeout_s
+        if not self._wait_until(lambda: _is_acknowledged(publisher), timeout_s):
+            raise PlaybackError(
+                f'a subscriber of {publisher.topic_name} has not taken all messages within {timeout_s:g} s'
+            )
 
     def _summary(self, seconds: float) -> str:
-        unpaired = self._backlog.num_unpaired
+        unpaired, late_ms = self._backlog.num_unpaired, self._lateness.p95_ms
         return (
             f'played {self._num_messages} messages in {seconds:.1f} s, {self._backlog.num_colors} of them colour images'
             + (f'; {unpaired} of those have no depth image in the recording' if unpaired else '')
+            + (f'; 95 % of all at most {late_ms:.1f} ms late' if self._clock.rate and late_ms is not None else '')
         )
 
     # --- answers ---
@@ -293,28 +297,19 @@ class Player:
 
     def _step(self, seconds: float) -> None:
         """Give ROS up to some time, then look at signals, keys, clock and graph."""
-        self._executor.spin_once(timeout_sec=min(max(seconds, 0.0), STEP_S, self._clock_period_s()))
+        self._executor.spin_once(timeout_sec=min(max(seconds, 0.0), STEP_S, self._sim_clock.period_s))
         if self._stop.requested:
             raise Interrupted(self.progress)
-        if self._keyboard.pressed() == ' ':
-            self._toggle_pause()
+        if self._controls.is_stopped:
+            raise _Stopped
+        self._controls.look_at_keys()
         if not self._answers and self._color and _is_acknowledged(self._publishers[self._color]):
             self._backlog.all_answered()
+        self._sim_clock.tick()
         now_s = time.monotonic()
-        if self._clock_publisher is not None and now_s >= self._clock_due_s:
-            self._clock_due_s = now_s + self._clock_period_s()
-            self._publish_clock(self._clock_publisher)
         if now_s >= self._look_around_due_s:
             self._look_around_due_s = now_s + LOOK_AROUND_S
             self._look_around()
-
-    def _clock_period_s(self) -> float:
-        return 1 / self._options.clock_hz if self._options.clock_hz else STEP_S
-
-    def _publish_clock(self, publisher: Publisher) -> None:
-        message = Clock()
-        message.clock.sec, message.clock.nanosec = stamps.from_ns(self._clock.now_ns())
-        publisher.publish(message)
 
     def _look_around(self) -> None:
         """Notice who has come and who has left.
@@ -329,15 +324,6 @@ class Player:
             raise PlaybackError(f'{who} left in mid-playback; {self.progress}')
         for answers in self._answers[1:]:
             answers.discover()
-
-    def _toggle_pause(self) -> None:
-        self._is_paused = not self._is_paused
-        if self._is_paused:
-            self._clock.freeze()
-        else:
-            self._clock.thaw()
-        key = 'space goes on' if self._keyboard.is_attached else 'no terminal to press space in'
-        self._say(f'paused ({key})' if self._is_paused else 'playing')
 
     def _is_image(self, name: str) -> bool:
         return self._recording.topics[name].is_image

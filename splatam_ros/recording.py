@@ -1,4 +1,4 @@
-"""A rosbag2 recording as raw messages, the way the player wants them: nothing is decoded."""
+"""A recording as raw messages, the way the player wants them: nothing is decoded."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 from rclpy.serialization import deserialize_message
-from rosbags.interfaces import Qos, QosDurability
-from rosbags.rosbag2 import Reader
+from rosbags.interfaces import Connection, Qos, QosDurability
 
 from splatam_core.errors import DatasetError
+from splatam_ros.storage import Storage, open_storage
 
 COLOR_OR_DEPTH = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 DEPTH_ENCODINGS = ('16uc1', '32fc1', 'mono16')
 HEADER_TYPE = 'std_msgs/Header'
+STATIC_TRANSFORMS = '/tf_static'
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,20 +31,25 @@ class RecordedTopic:
         name: as recorded.
         type_name: e.g. ``sensor_msgs/msg/Image``.
         message_class: rclpy's class of that type.
-        is_latched: recorded with transient-local durability by all its publishers.
-        depth: deepest history any of them had; 0 = not recorded.
+        offered: the QoS of each of its publishers, as far as recorded.
     """
 
     name: str
     type_name: str
     message_class: type
-    is_latched: bool
-    depth: int
+    offered: tuple[Qos, ...]
 
     @property
     def is_image(self) -> bool:
         """Whether it carries images, raw or compressed."""
         return self.type_name in COLOR_OR_DEPTH
+
+    @property
+    def is_latched(self) -> bool:
+        """Whether who comes late gets the last messages too; of ``/tf_static`` everybody expects that."""
+        if self.name == STATIC_TRANSFORMS:
+            return True
+        return bool(self.offered) and all(qos.durability is QosDurability.TRANSIENT_LOCAL for qos in self.offered)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +68,7 @@ class RawMessage:
 
 
 class Recording:
-    """An open rosbag2: a folder, or a single .db3 or .mcap file. Use as a context manager.
+    """An open rosbag2 (folder, .db3 or .mcap) or ROS 1 bag (.bag). Use as a context manager.
 
     Attributes:
         topics: by name, those that can be published here.
@@ -76,46 +81,44 @@ class Recording:
         """Open it.
 
         Raises:
-            DatasetError: it is no rosbag2, cannot be read, or holds no message.
+            DatasetError: it is no recording, cannot be read, or holds no message.
         """
         self.path = path
-        if path.suffix == '.bag':
-            raise DatasetError(f"{path} is a ROS 1 bag: 'rosbags-convert --src {path} --dst FOLDER' makes a rosbag2")
         with self._read_errors():
-            self._reader = Reader(path)
-            self._reader.open()
-        self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time - 1
+            self._storage: Storage = open_storage(path)
+        self.start_ns, self.end_ns = self._storage.start_ns, self._storage.end_ns
         self.topics: dict[str, RecordedTopic] = {}
         self.skipped: dict[str, str] = {}
         for name, connections in self._connections().items():
             self._add_topic(name, connections)
-        if self._reader.message_count == 0:
+        if self._storage.num_messages == 0:
             self.close()
             raise DatasetError(f'{path}: the recording holds no message')
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first message to the last."""
+        return (self.end_ns - self.start_ns) / 1e9
 
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[RawMessage]:
-        """Messages in the order of recording.
+        """Messages in the order of their recording.
 
         Args:
-            topics: names; all of these must be in ``topics``.
+            topics: names of those to read.
             start_ns: leave out what was recorded before.
-            stop_ns: leave out what was recorded at or after.
+            stop_ns: leave out what was recorded at or after this.
 
         Raises:
-            DatasetError: the recording breaks off or is damaged here.
+            DatasetError: the files are damaged.
         """
-        connections = [connection for connection in self._reader.connections if connection.topic in topics]
+        connections = [connection for connection in self._storage.connections if connection.topic in topics]
         if not connections:  # an empty list would mean all
             return
         with self._read_errors():
-            for connection, time_ns, data in self._reader.messages(connections, start_ns, stop_ns):
-                yield RawMessage(connection.topic, time_ns, bytes(data))
-
-    def count(self, topics: Collection[str]) -> int:
-        """Number of messages on these topics."""
-        return sum(connection.msgcount for connection in self._reader.connections if connection.topic in topics)
+            for connection, time_ns, data in self._storage.messages(connections, start_ns, stop_ns):
+                yield RawMessage(connection.topic, time_ns, data)
 
     def is_depth(self, topic: str) -> bool:
         """Whether an image topic carries depth, by what its first message says."""
@@ -130,8 +133,7 @@ class Recording:
 
     def close(self) -> None:
         """Close the files."""
-        if self._reader.is_open:
-            self._reader.close()
+        self._storage.close()
 
     def __enter__(self) -> Recording:
         return self
@@ -141,14 +143,14 @@ class Recording:
     ) -> None:
         self.close()
 
-    def _connections(self) -> dict[str, list[Any]]:
-        by_name: dict[str, list[Any]] = {}
-        for connection in self._reader.connections:
+    def _connections(self) -> dict[str, list[Connection]]:
+        by_name: dict[str, list[Connection]] = {}
+        for connection in self._storage.connections:
             by_name.setdefault(connection.topic, []).append(connection)
         return by_name
 
-    def _add_topic(self, name: str, connections: list[Any]) -> None:
-        type_names = {connection.msgtype for connection in connections}
+    def _add_topic(self, name: str, connections: list[Connection]) -> None:
+        type_names = {self._storage.type_name(connection) for connection in connections}
         if len(type_names) > 1:
             self.skipped[name] = f'it has several types: {", ".join(sorted(type_names))}'
             return
@@ -158,10 +160,8 @@ class Recording:
         except LookupError as error:
             self.skipped[name] = str(error)
             return
-        profiles: list[Qos] = [qos for connection in connections for qos in connection.ext.offered_qos_profiles]
-        is_latched = bool(profiles) and all(qos.durability is QosDurability.TRANSIENT_LOCAL for qos in profiles)
-        depth = max((qos.depth for qos in profiles), default=0)
-        self.topics[name] = RecordedTopic(name, type_name, cls, is_latched, depth)
+        offered = tuple(qos for connection in connections for qos in self._storage.offered(connection))
+        self.topics[name] = RecordedTopic(name, type_name, cls, offered)
 
     @contextmanager
     def _read_errors(self) -> Iterator[None]:
@@ -171,8 +171,9 @@ class Recording:
         except FileNotFoundError as error:
             raise DatasetError(f'{self.path}: {error}') from None
         except Exception as error:
+            kind = 'a ROS 1 bag' if self.path.suffix == '.bag' else 'rosbag2'
             reason = ' '.join(str(error).split()) or type(error).__name__
-            raise DatasetError(f'{self.path}: cannot be read as rosbag2: {reason}') from error
+            raise DatasetError(f'{self.path}: cannot be read as {kind}: {reason}') from error
 
 
 def message_class(type_name: str) -> type:

@@ -9,7 +9,6 @@ import signal
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from geometry_msgs.msg import PoseStamped
@@ -177,7 +176,7 @@ def test_never_more_than_n_frames_ahead_of_the_answers(graph: Graph, bag: Path) 
     node = Answering(graph)
     player = graph.play(str(bag), '--rate', 'max', '--wait-for', '--max-ahead', '3')
     for answered in range(9):
-        graph.spin_until(lambda: node.num_ahead == 3, explain=lambda: player.text)  # noqa: B023
+        graph.spin_until(lambda: node.num_ahead == 3, explain=lambda: player.text)
         graph.spin_for(0.1)
         assert node.num_colors == answered + 3
         node.answer()
@@ -354,7 +353,7 @@ def test_unusable_recordings_are_one_line(
     ('arguments', 'message'),
     [
         (['/nowhere/bag'], '/nowhere/bag'),
-        (['/nowhere/some.bag'], 'rosbags-convert'),
+        (['/nowhere/some.bag'], '/nowhere/some.bag'),
         (['BAG', '--topics', '/rgb/imag'], '/rgb/imag is not in'),
         (['BAG', '--start-offset', '5'], 'lasts 0.4 s'),
         (['BAG', '--rate', '-1'], 'expected 0 or more'),
