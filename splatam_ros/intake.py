@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import Any, TypeVar
 
 from msg_adapters import camera_info, images, stamps
@@ -12,10 +14,12 @@ from msg_adapters.synchronizer import RgbdSet, RgbdSynchronizer, SyncStatistics
 from splatam_core.camera import CameraCalibration, FrameFactory
 from splatam_core.errors import CameraError, FrameError
 from splatam_core.types import RgbdFrame
+from splatam_ros.gate import Gate
 from splatam_ros.parameters import NodeOptions
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 T = TypeVar('T')
+FAR_APART_NS = 20_000_000  # as rtabmap_ros warns from
 
 
 class Intake:
@@ -25,13 +29,27 @@ class Intake:
         camera_frame: frame id of the camera of the newest frame.
     """
 
-    def __init__(self, options: NodeOptions, warnings: ThrottledWarnings) -> None:
+    def __init__(
+        self, options: NodeOptions, warnings: ThrottledWarnings, gate: Gate, on_skipped: Callable[[int], None]
+    ) -> None:
+        """Prepare.
+
+        Args:
+            options: the node's.
+            warnings: where to say what is left out.
+            gate: asked for each frame before it is decoded.
+            on_skipped: called with the stamp (ns) of each frame that the gate does not let through.
+        """
         self.camera_frame = ''
         self._synchronizer = RgbdSynchronizer(
-            options.sync_mode, round(options.sync_max_interval * 1e9), options.sync_queue_size
-        )
+            options.sync_mode, round(options.sync_max_interval * 1e9), options.sync_queue_size,
+            round(options.time_jump_threshold * 1e9),
+        )  # fmt: skip
         self._width = options.width or None
+        self._is_rectified = not options.undistort
         self._warnings = warnings
+        self._gate = gate
+        self._on_skipped = on_skipped
         self._factory: FrameFactory | None = None
         self._reported = self._synchronizer.statistics
 
@@ -50,7 +68,8 @@ class Intake:
 
     def info(self, message: Any) -> list[RgbdFrame]:
         """Take a CameraInfo; the frames that waited for the first. One that makes no sense changes nothing."""
-        parameters = self._attempt('CameraInfo', camera_info.parameters, message)
+        read = partial(camera_info.parameters, is_rectified=self._is_rectified)
+        parameters = self._attempt('CameraInfo', read, message)
         if parameters is None:
             return []
         return self._frames(self._synchronizer.add_info(stamps.message_stamp_ns(message), parameters))
@@ -74,8 +93,14 @@ class Intake:
             self._warnings.warn(f'dropped {kind}', f'{count} image{"s" if count > 1 else ""} dropped: {what}')
 
     def _frames(self, sets: list[RgbdSet]) -> list[RgbdFrame]:
-        frames = [self._frame(found) for found in sets]
+        frames = [self._frame(found) for found in sets if self._is_admitted(found)]
         return [frame for frame in frames if frame is not None]
+
+    def _is_admitted(self, found: RgbdSet) -> bool:
+        is_admitted = self._gate.admits(found.resets, found.stamp_ns)
+        if not is_admitted:
+            self._on_skipped(found.stamp_ns)
+        return is_admitted
 
     def _frame(self, found: RgbdSet) -> RgbdFrame | None:
         factory = self._attempt('camera', self._frame_factory, found.info)
@@ -84,7 +109,22 @@ class Intake:
         if factory is None or rgb is None or depth_m is None:
             return None
         self.camera_frame = found.info.frame_id or found.color.header.frame_id
-        return self._attempt('frame', lambda stamp_ns: factory.make(stamp_ns, rgb, depth_m), found.stamp_ns)
+        self._warn_of_what_may_not_fit(found)
+        frame = self._attempt('frame', lambda stamp_ns: factory.make(stamp_ns, rgb, depth_m), found.stamp_ns)
+        return None if frame is None else replace(frame, epoch=found.resets)
+
+    def _warn_of_what_may_not_fit(self, found: RgbdSet) -> None:
+        if abs(found.gap_ns) > FAR_APART_NS:
+            self._warnings.warn(
+                'gap', f'depth is {found.gap_ns / 1e9:+.3f} s from its colour: a moving camera will smear the map; '
+                'synchronize the two in the driver, or lower sync.max_interval',
+            )  # fmt: skip
+        color, depth = found.color.header.frame_id, found.depth.header.frame_id
+        if color != depth and color and depth:
+            self._warnings.warn(
+                'frame ids', f"depth is in frame '{depth}', colour in '{color}': depth must be registered to colour; "
+                'if it is not, use the depth that the driver aligns (RealSense: aligned_depth_to_color)',
+            )  # fmt: skip
 
     def _frame_factory(self, parameters: CameraParameters) -> FrameFactory:
         calibration = CameraCalibration.from_intrinsics(parameters)

@@ -10,18 +10,25 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
+from splatam_core import environment
 from splatam_core.config import SlamConfig, apply_threads
 from splatam_core.errors import FrameError, SplatamError
-from splatam_core.run_folder import RunDescription, RunFolder
 from splatam_core.slam import Slam
 from splatam_core.trajectory import stamp_text
 from splatam_core.types import FrameResult, RgbdFrame, Status
 from splatam_core.worker import SlamWorker, WorkerStopped
 from splatam_ros import parameters
-from splatam_ros.diagnosis import why_no_frames
+from splatam_ros.diagnosis import Silence
+from splatam_ros.diagnostics import InputSample, Monitor, Sample
+from splatam_ros.gate import Gate
+from splatam_ros.geometry import Geometry
 from splatam_ros.inputs import Input
 from splatam_ros.intake import Intake
 from splatam_ros.outputs import Outputs
+from splatam_ros.parameters import NodeOptions
+from splatam_ros.reconfiguration import Reconfiguration
+from splatam_ros.services import Services
+from splatam_ros.session import Session
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 TICK_S = 0.2
@@ -48,39 +55,44 @@ class SplatamNode(Node):
             SplatamError: a parameter cannot be used, or there is no place to save to.
         """
         super().__init__('splatam', automatically_declare_parameters_from_overrides=True)
-        self.options, self.config = parameters.declare(self)
-        apply_threads(self.config)
+        self.options, config = parameters.declare(self)
+        apply_threads(config)
         self.is_finished = False
         self._warnings = ThrottledWarnings(self.get_logger())
-        self._slam = Slam(self.config)
-        self._intake = Intake(self.options, self._warnings)
-        self._outputs = Outputs(self, self.options)
+        self._gate = Gate(self.options.max_rate_hz)
+        self._geometry = Geometry(self, self.options, self._warnings, lambda: self._intake.camera_frame)
+        self._outputs = Outputs(self, self.options, self._geometry)
+        self._intake = Intake(self.options, self._warnings, self._gate, self._outputs.done)
+        self._session = Session(self.options, config, self.get_logger(), self._outputs)
+        self._slam = Slam(config, self._geometry.prior)
+        if self.options.load_path:
+            self._session.load(self._slam)
         self._inputs = self._subscribe()
-        self._folder = self._create_folder()
+        self._silence = Silence(self, self._inputs)
         self._counts = dict.fromkeys(Status, 0)
-        self._num_dropped = 0
-        self._heard_s = self._supplied_s = self._progress_s = time.monotonic()
-        self._had_publishers = self._has_told_why = False
+        self._num_dropped = self._num_refused = 0
+        self._result: FrameResult | None = None
+        self._delay_s: float | None = None
+        self._heard_s = self._progress_s = time.monotonic()
+        self._had_publishers = False
         self.create_timer(TICK_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
         # Last, since a thread must be joined: nothing after this may fail.
         self._worker = SlamWorker(
             self._slam, self._on_result, self._on_bad_frame, queue_size=self.options.queue_size,
-            when_full='block' if self._keeps_all else 'drop_oldest',
+            when_full='block' if self._keeps_all else 'drop_oldest', before_frame=self._session.before_frame,
         )  # fmt: skip
+        self._controls = Services(self, self._worker, self._session, self._gate)
+        self._reconfiguration = Reconfiguration(self, self.options, config, self._use_options, self._use_config)
         self.get_logger().info(
             f"preset '{self.options.preset}', waiting for {', '.join(item.topic for item in self._inputs)}, "
-            + (f'saving to {self._folder.path}' if self._folder else 'saving nothing: save_path is empty')
+            + (f'saving to {self._session.folder}' if self._session.folder else 'saving nothing: save_path is empty')
         )
+
+        self._monitor = Monitor(self, self._sample, lambda: self._geometry.camera_frame)
 
     @property
     def _keeps_all(self) -> bool:
         return self.options.queue_policy == 'all'
-
-    def _create_folder(self) -> RunFolder | None:
-        if self.options.folder is None:
-            return None
-        description = RunDescription('splatam_node', self.options.preset)
-        return RunFolder.create(self.options.folder, self.config, description, overwrite=self.options.overwrite)
 
     def _subscribe(self) -> list[Input]:
         rgb_suffix, rgb_class = TRANSPORTS[self.options.rgb_transport]
@@ -118,17 +130,18 @@ class SplatamNode(Node):
             except WorkerStopped:  # why is said when the node closes
                 self.is_finished = True
                 return
-            self._supplied_s = time.monotonic()
-            self._has_told_why = False
+            self._silence.end()
 
     def _tick(self) -> None:
         quiet_s = time.monotonic() - self._heard_s
         if self._worker.pending:
-            self._supplied_s = time.monotonic()
+            self._silence.postpone()
         elif self._stalls_on_lookahead(quiet_s):
             self._supply(self._intake.flush())
+        elif self._outputs.is_behind:
+            self._worker.call(lambda slam: self._outputs.catch_up())
         self._report_drops()
-        self._explain_silence()
+        self._silence.check(self._intake.statistics, self.options)
         self._check_end(quiet_s)
 
     def _stalls_on_lookahead(self, quiet_s: float) -> bool:
@@ -148,13 +161,6 @@ class SplatamNode(Node):
             )  # fmt: skip
         self._num_dropped = dropped
 
-    def _explain_silence(self) -> None:
-        timeout_s = self.options.no_data_timeout
-        if timeout_s and not self._has_told_why and time.monotonic() - self._supplied_s > timeout_s:
-            self._has_told_why = True
-            why = why_no_frames(self._inputs, self._intake.statistics, self.options)
-            self.get_logger().warning(f'no frame for {timeout_s:g} s: {why}')
-
     def _check_end(self, quiet_s: float) -> None:
         """Finish when the worker broke down, or the image publishers have left and all of theirs is processed."""
         images = self._inputs[1:]
@@ -166,6 +172,27 @@ class SplatamNode(Node):
         elif self.options.exit_on_publisher_end and self._had_publishers and not has_publishers and quiet_s > QUIET_S:
             self._supply(self._intake.flush())
             self.is_finished |= self._worker.pending == 0
+
+    def _sample(self) -> Sample:
+        waiting = self._intake.statistics
+        inputs = [
+            InputSample(item.topic, item.received, item.num_publishers, item.delay_s)
+            for item in self._inputs
+        ]
+        return Sample(
+            time.monotonic(), inputs, waiting.unpaired_color + waiting.unpaired_depth, self._worker.pending,
+            self._worker.dropped, self._num_refused, dict(self._counts), self._outputs.num_poses, self._delay_s,
+            self._result, environment.rss_mb(),
+            self._silence.why,
+        )  # fmt: skip
+
+    def _use_options(self, options: NodeOptions) -> None:
+        self.options = self._session.options = options
+        self._gate.max_rate_hz = options.max_rate_hz
+        self._outputs.use(options)
+
+    def _use_config(self, config: SlamConfig) -> None:
+        self._worker.call(lambda slam: slam.configure(config))
 
     def close(self) -> bool:
         """Take no more messages, finish what waits, save, destroy. Whether all went well."""
@@ -180,14 +207,11 @@ class SplatamNode(Node):
         return is_fine
 
     def _save(self) -> None:
-        if self._folder is None:
-            return
-        if not self.options.save_on_shutdown:
-            self._folder.close()
-            return
-        metrics = self._folder.finish(self._slam)
-        self.get_logger().info(f'saved {metrics.frames} frames, {metrics.tracked} of them tracked, and '
-                               f'{metrics.num_gaussians} Gaussians in {self._folder.path}')  # fmt: skip
+        try:
+            if self.options.folder is not None and self.options.save_on_shutdown:
+                self._session.save(self._slam)
+        finally:
+            self._session.close()
 
     def _attempt(self, what: str, action: Callable[[], object]) -> bool:
         """Do something that must not keep the rest of the shutdown from happening."""
@@ -204,15 +228,19 @@ class SplatamNode(Node):
     # --- worker's thread ---
 
     def _on_result(self, frame: RgbdFrame, result: FrameResult) -> None:
-        if self._folder is not None:  # before anybody hears of the frame: what was answered is on disk
-            self._folder.append(frame, result, result.timings.total / 1e3)
+        self._session.record(frame, result)  # before anybody hears of the frame: what was answered is on disk
         self._counts[result.status] += 1
         if result.status is Status.LOST:
             self._warnings.warn('lost', f'lost at {stamp_text(result.stamp_ns)}: {result.reason}')
-        self._outputs.publish(result, self._slam, self._intake.camera_frame)
+        self._result = result
+        self._outputs.publish(result, self._slam)
+        if result.T_world_cam is not None:
+            self._delay_s = (self.get_clock().now().nanoseconds - result.stamp_ns) / 1e9
         self._log_progress(result)
+        self._session.after_frame(self._slam, result)
 
     def _on_bad_frame(self, frame: RgbdFrame, error: FrameError) -> None:
+        self._num_refused += 1
         self._warnings.warn('refused', f'frame {stamp_text(frame.stamp_ns)} left out: {error}')
         self._outputs.done(frame.stamp_ns)
 

@@ -33,18 +33,45 @@ def _setting(
 NODE_SETTINGS: tuple[Setting, ...] = (
     _setting('preset', 'quick', 'SLAM preset: the name of a shipped one, or a .yaml file.'),
     _setting('save_path', '', 'New or empty folder for trajectory, map and metrics; none = nothing is saved.'),
+    _setting('save_root', '', 'save_path may change at run time to a folder below this; none = not at all.'),
     _setting('overwrite', False, 'Replace the run that is in save_path, if nothing else is there.'),
     _setting('save_on_shutdown', True, 'Save map and metrics at the end; the trajectory is written as it goes anyway.'),
+    _setting('load_path', '', 'Map for ~/load_map, a .ply file or the folder of a run; loaded at the start, too.'),
+    _setting('load_pose', '', 'Where the camera is in a loaded map, x y z qx qy qz qw; none = where it began.', 'm'),
     _setting('width', 0, 'Resize frames to this width; 0 = as they come.', 'px', 0, 16384),
-    _setting('map_frame', 'map', 'Frame of poses and map: the first camera, optical axes.'),
+    _setting('map_frame', 'map', 'Frame of poses and map.'),
+    _setting('odom_frame', 'odom', 'Frame between map and base; empty = base is a child of map.'),
+    _setting('base_frame', '', 'Frame of the robot that the camera is fixed to; empty = the camera is all there is.'),
+    _setting('camera_frame', '', "Optical frame of the camera; empty = as the images' headers say."),
+    _setting('camera_in_base', '', 'Pose of the camera in base_frame: x y z qx qy qz qw, or x y z roll pitch yaw; '
+             'empty = from /tf_static.', 'm, rad'),
+    _setting('world_up', 'optical', "Axes of map_frame: the first camera's (z forward, y down), or upright (z up).",
+             choices=('optical', 'z_up')),
+    _setting('publish_tf', True, 'Publish transforms.'),
+    _setting('odom.source', 'none', 'Where to start tracking from: constant velocity, the topic odom, or '
+             'odom_frame to base_frame on TF; with the latter two map to odom_frame is published as their correction.',
+             choices=('none', 'topic', 'tf')),
+    _setting('odom.max_wait', 0.1, 'Wait this long for odometry that is newer than the frame.', 's', 0.0, 10.0),
+    _setting('stddev.position', 0.02, 'Of the pose that ~/odometry states, where all of a frame agrees with the map.',
+             'm', 1e-6, 100.0),
+    _setting('stddev.orientation', 0.01, 'Likewise.', 'rad', 1e-6, 10.0),
     _setting('rgb_transport', 'raw', 'What rgb/image carries; compressed: rgb/image/compressed.',
              choices=('raw', 'compressed')),
     _setting('depth_transport', 'raw', 'What depth/image carries; compressedDepth: depth/image/compressedDepth.',
              choices=('raw', 'compressedDepth')),
+    _setting('undistort', True, 'Undistort images by K and D; off = they are rectified (image_rect) to camera P.'),
     _setting('sync.mode', 'approximate', 'Pair colour and depth of equal, or of nearby stamps.',
              choices=('exact', 'approximate')),
     _setting('sync.max_interval', 0.02, 'Stamps of a pair differ by at most this.', 's', 0.0, 10.0),
     _setting('sync.queue_size', 30, 'Images of each kind that wait for their partner.', '', 1, 1000),
+    _setting('on_time_jump', 'reset', 'When stamps jump back (a recording loops): new map, or go on in this one.',
+             choices=('reset', 'continue')),
+    _setting('time_jump_threshold', 1.0, 'Stamps that fall back by more have jumped; by less, they are late.', 's',
+             0.0, 3600.0),
+    _setting('on_camera_change', 'reset', 'When CameraInfo changes: new map, or refuse frames of another camera.',
+             choices=('reset', 'refuse')),
+    _setting('lost_reset_after', 0.0, 'Start a new map when lost for this long; 0 = never.', 's', 0.0, 3600.0),
+    _setting('max_rate_hz', 0.0, 'Frames to SLAM in a second of their own time at most; 0 = all.', 'Hz', 0.0, 1000.0),
     _setting('input_reliability', 'auto', 'QoS of the inputs; auto: reliable, unless a publisher is best effort.',
              choices=('auto', 'reliable', 'best_effort')),
     _setting('queue_policy', 'latest', 'When frames come faster than SLAM: latest drops old ones, all keeps every one.',
@@ -66,15 +93,34 @@ class NodeOptions:
 
     preset: str
     save_path: str
+    save_root: str
     overwrite: bool
     save_on_shutdown: bool
+    load_path: str
+    load_pose: str
     width: int
     map_frame: str
+    odom_frame: str
+    base_frame: str
+    camera_frame: str
+    camera_in_base: str
+    world_up: str
+    publish_tf: bool
+    odom_source: str
+    odom_max_wait: float
+    stddev_position: float
+    stddev_orientation: float
     rgb_transport: str
     depth_transport: str
+    undistort: bool
     sync_mode: str
     sync_max_interval: float
     sync_queue_size: int
+    on_time_jump: str
+    time_jump_threshold: float
+    on_camera_change: str
+    lost_reset_after: float
+    max_rate_hz: float
     input_reliability: str
     queue_policy: str
     queue_size: int
@@ -90,6 +136,38 @@ class NodeOptions:
     def folder(self) -> Path | None:
         """Where to save; None = nowhere."""
         return Path(self.save_path).expanduser() if self.save_path else None
+
+
+def field_name(name: str) -> str:
+    """The field of ``NodeOptions`` that a parameter is in."""
+    return name.replace('.', '_')
+
+
+# Everything else is read when the node starts.
+CHANGEABLE = frozenset({
+    'save_path', 'save_on_shutdown', 'load_path', 'load_pose', 'on_time_jump', 'on_camera_change', 'lost_reset_after',
+    'max_rate_hz', 'max_cloud_points', 'publish_rate.path', 'publish_rate.render', 'publish_rate.cloud',
+    'no_data_timeout', 'exit_on_publisher_end',
+})  # fmt: skip
+FIXED = {
+    'preset': 'it is what all other settings start from; change those below slam.',
+    'save_root': 'it is the limit of what may be changed',
+    'width': 'frames of another size are those of another camera',
+    'max_path_poses': 'the path so far is thinned out by it',
+    'slam.seed': 'it is where the random choices of this map started',
+    'slam.threads': 'the threads are running',
+    'slam.rasterizer': 'it is made when the node starts',
+    'slam.tracking.motion_model': 'it is made when the map starts',
+    'slam.mapping.mode': 'the threads are running',
+    'slam.mapping.scene_radius_ratio': 'it is read when the map starts',
+}
+
+
+def why_fixed(name: str) -> str:
+    """Why a parameter cannot change while the node runs; empty if it can."""
+    if name in CHANGEABLE or (name.startswith(SLAM) and name not in FIXED):
+        return ''
+    return FIXED.get(name, 'it is read when the node starts')
 
 
 def declare(node: Node) -> tuple[NodeOptions, SlamConfig]:
@@ -108,7 +186,7 @@ def declare(node: Node) -> tuple[NodeOptions, SlamConfig]:
     values = flat_values(config)
     for setting in settings():
         _declare(node, SLAM + setting.name, setting, values[setting.name])
-    return NodeOptions(**{name.replace('.', '_'): value for name, value in own.items()}), config
+    return NodeOptions(**{field_name(name): value for name, value in own.items()}), config
 
 
 def _checked(given: Mapping[str, object]) -> dict[str, Value]:
@@ -136,14 +214,16 @@ def _declare(node: Node, name: str, setting: Setting, value: Value) -> None:
     """Declare one parameter, anew if the user gave it: only now its type and bounds are known to ROS."""
     if node.has_parameter(name):
         node.undeclare_parameter(name)
-    node.declare_parameter(name, value, _descriptor(setting), ignore_override=True)
+    node.declare_parameter(name, value, _descriptor(setting, why_fixed(name)), ignore_override=True)
 
 
-def _descriptor(setting: Setting) -> ParameterDescriptor:
+def _descriptor(setting: Setting, why_fixed: str) -> ParameterDescriptor:
     unit = f' [{setting.unit}]' if setting.unit else ''
-    descriptor = ParameterDescriptor(description=setting.help + unit, read_only=True)
-    if setting.choices:
-        descriptor.additional_constraints = 'one of ' + ', '.join(setting.choices)
+    # Not read_only: ROS would refuse a change before we can say why.
+    descriptor = ParameterDescriptor(description=setting.help + unit)
+    constraints = ['one of ' + ', '.join(setting.choices)] if setting.choices else []
+    constraints += [f'cannot change at run time: {why_fixed}'] if why_fixed else []
+    descriptor.additional_constraints = '; '.join(constraints)
     if setting.minimum is None and setting.maximum is None:
         return descriptor
     if setting.type is int:

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
+from builtin_interfaces.msg import Time
+from camera import Camera
 from graph import Graph
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from msg_adapters import camera_info
 from msg_adapters.camera_info import CameraParameters
 from msg_adapters.factory import RclpyMessages
 from splatam_ros.diagnosis import why_no_frames
+from splatam_ros.gate import Gate
 from splatam_ros.inputs import Input
 from splatam_ros.intake import Intake
 from splatam_ros.parameters import NODE_SETTINGS, NodeOptions
 from splatam_ros.throttled_warnings import ThrottledWarnings
+
+STREAMS = ((CameraInfo, '/rgb/camera_info'), (Image, '/rgb/image'), (Image, '/depth/image'))
 
 
 class Receiver:
@@ -23,7 +32,10 @@ class Receiver:
     def __init__(self, graph: Graph, **options: object) -> None:
         defaults = {setting.name.replace('.', '_'): setting.default for setting in NODE_SETTINGS}
         self.options = NodeOptions(**{**defaults, **options})
-        self.intake = Intake(self.options, ThrottledWarnings(graph.node.get_logger()))
+        self.node = graph.node
+        self.skipped: list[int] = []
+        warnings = ThrottledWarnings(graph.node.get_logger())
+        self.intake = Intake(self.options, warnings, Gate(self.options.max_rate_hz), self.skipped.append)
         self.inputs = [
             Input(graph.node, message_class, topic, add, reliability=self.options.input_reliability, keep_all=False)
             for message_class, topic, add in (
@@ -34,7 +46,7 @@ class Receiver:
         ]
 
     def why(self) -> str:
-        return why_no_frames(self.inputs, self.intake.statistics, self.options)
+        return why_no_frames(self.node, self.inputs, self.intake.statistics, self.options)
 
 
 def image(stamp_ms: int) -> Image:
@@ -49,6 +61,7 @@ def test_each_cause_is_told_apart(graph: Graph) -> None:
     color = graph.publisher(Image, '/rgb/image')
     info = graph.publisher(CameraInfo, '/rgb/camera_info')
     graph.spin_until(lambda: 'no publisher on /depth/image;' in receiver.why(), explain=receiver.why)
+    assert 'of that type there is /rgb/image; remap: -r depth/image:=/rgb/image' in receiver.why()
     depth = graph.publisher(Image, '/depth/image')
     graph.spin_until(lambda: 'are published, but no message has come' in receiver.why(), explain=receiver.why)
     color.publish(image(100))
@@ -60,6 +73,40 @@ def test_each_cause_is_told_apart(graph: Graph) -> None:
     info.publish(camera_info.info_message(RclpyMessages(), camera, 0))
     graph.spin_until(lambda: 'nothing pairs' in receiver.why(), explain=receiver.why)
     assert '0.250 s apart' in receiver.why() and 'sync.max_interval is 0.02 s' in receiver.why()
+    receiver.options = replace(receiver.options, no_data_timeout=0.2)
+    graph.spin_for(0.3)
+    color.publish(image(400))
+    graph.spin_until(lambda: 'nothing has come on /depth/image for' in receiver.why(), explain=receiver.why)
+
+
+def test_another_type_on_the_topic(graph: Graph) -> None:
+    for message_class, topic in ((CameraInfo, '/rgb/camera_info'), (CompressedImage, '/rgb/image'), STREAMS[2]):
+        graph.publisher(message_class, topic)
+    node = graph.run_node(preset='quick', no_data_timeout=1.0)
+    carries = 'no frame for 1 s: /rgb/image carries sensor_msgs/msg/CompressedImage, expected sensor_msgs/msg/Image'
+    node.wait_says(carries, 'remap, or set rgb_transport')
+
+
+def test_sim_time_without_a_clock(graph: Graph) -> None:
+    receiver = Receiver(graph)
+    publishers = [graph.publisher(message_class, topic) for message_class, topic in STREAMS]
+    graph.spin_until(lambda: 'are published, but no message' in receiver.why(), explain=receiver.why)
+    graph.node.set_parameters([Parameter('use_sim_time', value=True)])
+    assert receiver.why().startswith('use_sim_time is true and /clock has no publisher')
+    clock = graph.publisher(Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    graph.spin_until(lambda: '/clock is published, but says nothing' in receiver.why(), explain=receiver.why)
+
+    def tick() -> bool:
+        clock.publish(Clock(clock=Time(sec=5)))
+        return 'are published, but no message' in receiver.why()
+
+    graph.spin_until(tick, explain=receiver.why)
+    assert publishers
+
+
+def test_names_are_those_after_remapping(graph: Graph) -> None:
+    node = graph.run_node('-r', 'rgb/image:=/camera/color', '-r', '__ns:=/robot', preset='quick', no_data_timeout=1.0)
+    node.wait_says('no publisher on /robot/rgb/camera_info, /camera/color and /robot/depth/image')
 
 
 @pytest.mark.parametrize(('reliability', 'is_heard'), [('auto', True), ('best_effort', True), ('reliable', False)])
@@ -75,4 +122,16 @@ def test_best_effort_publishers(graph: Graph, reliability: str, is_heard: bool) 
         graph.spin_until(lambda: all(item.received for item in receiver.inputs[1:]))
     else:
         graph.spin_until(lambda: 'incompatible QoS' in receiver.why(), explain=receiver.why)
-        assert 'set it to auto or best_effort' in receiver.why()
+        assert '(reliability)' in receiver.why() and 'set it to auto or best_effort' in receiver.why()
+
+
+@pytest.mark.parametrize(('overridden', 'option'), [('best_effort', 'reliable'), ('reliable', 'auto')])
+def test_qos_overrides_have_the_last_word(graph: Graph, overridden: str, option: str) -> None:
+    """Of a topic, whatever input_reliability says."""
+    override = f'qos_overrides./rgb/image.subscription.reliability:={overridden}'
+    node = graph.run_node('-p', override, preset='quick', input_reliability=option, no_data_timeout=1.0)
+    color = Camera(graph, ReliabilityPolicy.BEST_EFFORT).publisher('rgb')
+    if overridden == 'best_effort':
+        graph.spin_until(color.get_subscription_count, explain=lambda: node.text)
+    else:
+        node.wait_says('no frame for 1 s: the publisher of /rgb/image', 'incompatible QoS (reliability)')

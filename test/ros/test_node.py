@@ -7,23 +7,22 @@ import json
 import re
 import shutil
 import signal
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from camera import CAMERA_FRAME, LATCHED, MAKE, QUICK, SLAM, Camera, run_node, stamps_of, still
 from geometry_msgs.msg import PoseStamped
 from graph import Graph, Process, node_arguments
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from rclpy.qos import ReliabilityPolicy
+from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Header
 
-from msg_adapters import camera_info, images, point_clouds, poses, stamps
-from msg_adapters.factory import RclpyMessages
+from msg_adapters import images, point_clouds, poses, stamps
 from splatam_core.config import load_config
 from splatam_core.datasets.convert import write_bag
 from splatam_core.datasets.synthetic import SyntheticSequence
@@ -32,28 +31,10 @@ from splatam_core.run_folder import read_run
 from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame
 
-# These tests are about messages, not about maps: few steps, and nothing is lost that could be followed at all.
-QUICK = {
-    'tracking.iterations': 6, 'mapping.iterations': 3, 'mapping.every': 1, 'tracking.min_inlier_fraction': 0.1,
-    'threads': 1,
-}  # fmt: skip
-SLAM = {f'slam__{name.replace(".", "__")}': value for name, value in QUICK.items()}
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-MAKE = RclpyMessages()
-CAMERA_FRAME = 'camera_optical_frame'
-
-
-def run_node(graph: Graph, *ros_arguments: str, **parameters: Any) -> Process:
-    return graph.run_node(*ros_arguments, **{'preset': 'quick', **SLAM, **parameters})
-
 
 def trajectory_lines(folder: Path) -> list[str]:
     path = folder / 'trajectory.txt'
     return path.read_text().splitlines() if path.exists() else []
-
-
-def stamps_of(messages: list[Any]) -> list[int]:
-    return [stamps.message_stamp_ns(message) for message in messages]
 
 
 def newest_stamp(messages: list[Any]) -> int | None:
@@ -67,53 +48,12 @@ def offline(sequence: SyntheticSequence) -> tuple[Slam, list[np.ndarray]]:
     return slam, [slam.process(frame).T_world_cam for frame in sequence]
 
 
-class Camera:
-    """A camera of the test's, sending what it is told to."""
-
-    def __init__(self, graph: Graph, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> None:
-        qos = QoSProfile(depth=100, reliability=reliability)
-        self._graph = graph
-        self._publishers = {
-            'info': graph.publisher(CameraInfo, '/rgb/camera_info', qos),
-            'rgb': graph.publisher(Image, '/rgb/image', qos),
-            'depth': graph.publisher(Image, '/depth/image', qos),
-        }
-
-    def wait_matched(self) -> None:
-        publishers = self._publishers.values()
-        self._graph.spin_until(lambda: all(publisher.get_subscription_count() for publisher in publishers))
-
-    def send(self, frame: RgbdFrame, *, depth_delay_ns: int = 0, **changes: Any) -> None:
-        """Send a frame's three messages; ``rgb__encoding='x'`` changes a field of one."""
-        c, stamp = frame.camera, frame.stamp_ns
-        parameters = camera_info.CameraParameters(c.width, c.height, c.fx, c.fy, c.cx, c.cy, frame_id=CAMERA_FRAME)
-        messages = {
-            'info': camera_info.info_message(MAKE, parameters, stamp),
-            'rgb': images.color_message(MAKE, frame.rgb, stamp, CAMERA_FRAME),
-            'depth': images.depth_message(MAKE, frame.depth_m, stamp + depth_delay_ns, CAMERA_FRAME),
-        }
-        for name, value in changes.items():
-            message, _, attribute = name.partition('__')
-            setattr(messages[message], attribute, value)
-        for name, publisher in self._publishers.items():
-            publisher.publish(messages[name])
-
-
-@pytest.fixture(scope='session')
-def frames(room: Callable[..., SyntheticSequence]) -> SyntheticSequence:
-    """The frames of ``bag``."""
-    return room(frames=12, noise=False)
-
-
-def still(frames: SyntheticSequence, number: int) -> RgbdFrame:
-    """A frame of a camera that does not move: nothing that could be lost."""
-    return replace(frames[0], stamp_ns=10**9 + number * 10**8)
-
-
 # --- the whole way ---
 
 
-def test_recording_in_poses_renders_cloud_and_folder_out(graph: Graph, bag: Path, frames: SyntheticSequence) -> None:
+def test_recording_in_poses_renders_cloud_and_folder_out(
+    graph: Graph, bag: Path, frames: SyntheticSequence, tf_message: type
+) -> None:
     out = graph.folder / 'run'
     node = run_node(
         graph, save_path=out, queue_policy='all', exit_on_publisher_end=True,
@@ -327,8 +267,8 @@ def test_bad_input_is_a_warning_each_and_the_node_goes_on(graph: Graph, frames: 
     send_bad('depth left out', "'rgb8'", depth__encoding='rgb8')
     send_bad('CameraInfo left out', 'not calibrated', info__k=np.zeros(9))
     wide = frames[0]
-    send_bad('frame left out', '64x48', '32x24', depth__height=24, depth__width=32, depth__step=128,
-             depth__data=images.depth_message(MAKE, wide.depth_m[:24, :32], 0, '').data)  # fmt: skip
+    send_bad('frame left out', '64x48', '32x48', 'aligned_depth_to_color', depth__width=32, depth__step=128,
+             depth__data=images.depth_message(MAKE, wide.depth_m[:, :32], 0, '').data)  # fmt: skip
     last_ns = stamps.to_ns(done[-1].stamp)
     nothing = replace(wide, stamp_ns=last_ns + 1000, depth_m=np.full_like(wide.depth_m, np.nan))
     send_bad('lost', frame=nothing, depth__data=nan_depth(wide))
@@ -354,7 +294,7 @@ def nan_depth(frame: RgbdFrame) -> Any:
 def test_a_camera_that_changes_is_refused_and_the_first_one_goes_on(graph: Graph, frames: SyntheticSequence) -> None:
     camera, done = Camera(graph), graph.collect(Header, '/splatam/processed')
     tracked = graph.collect(PoseStamped, '/splatam/pose')
-    node = run_node(graph)
+    node = run_node(graph, on_camera_change='refuse')
     camera.wait_matched()
     first, second, third = (still(frames, number) for number in range(3))
     other = replace(second, camera=replace(second.camera, fx=60.0))

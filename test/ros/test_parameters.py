@@ -9,14 +9,16 @@ from typing import Any
 import pytest
 import rclpy
 from graph import Graph, node_arguments
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from splatam_core.config import load_config, settings
+from splatam_core.config import SlamConfig, load_config, settings
 from splatam_core.errors import ConfigError
 from splatam_ros import parameters
-from splatam_ros.parameters import NODE_SETTINGS
+from splatam_ros.parameters import NODE_SETTINGS, NodeOptions
+from splatam_ros.reconfiguration import Reconfiguration
 
 MakeNode = Callable[..., Node]
 
@@ -66,7 +68,9 @@ def test_every_setting_has_a_descriptor_with_help_and_bounds(make_node: MakeNode
     parameters.declare(node)
     for setting in settings():
         descriptor = node.describe_parameter(f'slam.{setting.name}')
-        assert descriptor.description.startswith(setting.help) and descriptor.read_only
+        assert descriptor.description.startswith(setting.help)
+        why = parameters.why_fixed(f'slam.{setting.name}')
+        assert ('cannot change at run time' in descriptor.additional_constraints) == bool(why)
         ranges = [*descriptor.integer_range, *descriptor.floating_point_range]
         assert len(ranges) == (setting.minimum is not None or setting.maximum is not None)
         if setting.minimum is not None:
@@ -98,8 +102,68 @@ def test_what_is_not_allowed_is_refused(make_node: MakeNode, values: dict[str, A
         parameters.declare(make_node(**values))
 
 
-def test_parameters_cannot_change_at_run_time(make_node: MakeNode) -> None:
-    node = make_node()
-    parameters.declare(node)
-    result = node.set_parameters([Parameter('slam.tracking.iterations', value=3)])[0]
-    assert not result.successful
+class Changes:
+    """A node whose parameters can change, and what it was told of that."""
+
+    def __init__(self, node: Node) -> None:
+        self.node = node
+        self.options: list[NodeOptions] = []
+        self.configs: list[SlamConfig] = []
+        Reconfiguration(node, *parameters.declare(node), self.options.append, self.configs.append)
+
+    def set(self, **values: Any) -> SetParametersResult:
+        changes = [Parameter(name.replace('__', '.'), value=value) for name, value in values.items()]
+        return self.node.set_parameters_atomically(changes)
+
+
+def test_what_may_change_at_run_time_is_handed_on(make_node: MakeNode) -> None:
+    changes = Changes(make_node())
+    assert changes.set(max_rate_hz=5.0, publish_rate__cloud=2.0, slam__tracking__iterations=3).successful
+    assert (changes.options[0].max_rate_hz, changes.options[0].publish_rate_cloud) == (5.0, 2.0)
+    assert changes.configs == [load_config('quick', {'tracking.iterations': 3})]
+    assert changes.set(slam__depth__max_m=3.0).successful
+    assert changes.configs[1] == load_config('quick', {'tracking.iterations': 3, 'depth.max_m': 3.0})
+    assert len(changes.options) == 1
+
+
+@pytest.mark.parametrize(
+    ('values', 'reason'),
+    [
+        ({'preset': 'tum'}, 'preset cannot change while the node runs: it is what all other settings start from'),
+        ({'width': 320}, 'width cannot change while the node runs: frames of another size'),
+        ({'sync__mode': 'exact'}, 'sync.mode cannot change while the node runs: it is read when the node starts'),
+        ({'slam__threads': 2}, 'slam.threads cannot change while the node runs: the threads are running'),
+        ({'save_path': '/tmp/elsewhere'}, 'save_root is empty'),
+        ({'max_rate_hz': -1.0}, 'max_rate_hz out of range'),
+        ({'slam__tracking__iterations': -1}, 'slam.tracking.iterations out of range'),
+        ({'max_rate_hz': 'fast'}, 'Wrong parameter type'),
+        ({'on_time_jump': 'explode'}, "on_time_jump = 'explode': expected one of reset, continue"),
+        ({'load_pose': '1 2 3'}, "load_pose = '1 2 3': expected 'x y z qx qy qz qw'"),
+        ({'load_pose': '1 2 3 0 0 0 0'}, "load_pose = '1 2 3 0 0 0 0': expected"),
+        ({'slam__depth__min_m': 200.0}, 'expected less than depth.max_m'),
+    ],
+)  # fmt: skip
+def test_what_may_not_change_at_run_time_is_refused_with_the_reason(
+    make_node: MakeNode, values: dict[str, Any], reason: str
+) -> None:
+    changes = Changes(make_node())
+    result = changes.set(**values, no_data_timeout=1.0)
+    assert not result.successful and reason in result.reason
+    assert not changes.options and not changes.configs  # all or nothing
+    assert changes.node.get_parameter('no_data_timeout').value == 5.0
+
+
+def test_a_folder_to_save_in_may_change_below_the_root_only(make_node: MakeNode, tmp_path: Path) -> None:
+    root, outside = tmp_path / 'root', tmp_path / 'outside'
+    for folder in (root / 'full', outside):
+        folder.mkdir(parents=True)
+    (root / 'full' / 'thesis.tex').touch()
+    (root / 'link').symlink_to(outside)
+    changes = Changes(make_node(save_root=root))
+    for path in (outside / 'run', root, root / '..' / 'outside' / 'run', root / 'link' / 'run'):
+        result = changes.set(save_path=str(path))
+        assert not result.successful and 'expected a folder below save_root' in result.reason, path
+    result = changes.set(save_path=str(root / 'full'))
+    assert not result.successful and 'choose another folder' in result.reason
+    assert changes.set(save_path=str(root / 'new' / 'run')).successful
+    assert [options.folder for options in changes.options] == [root / 'new' / 'run']

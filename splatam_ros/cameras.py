@@ -1,0 +1,92 @@
+"""Cameras that people have: what their drivers publish, for the launch file and the documentation.
+
+Taken from the drivers' own documentation, named in ``source``; no camera was at hand. Parameters that suit them are in
+``config/ros/NAME.yaml``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class CameraTopics:
+    """What a driver publishes.
+
+    Attributes:
+        title: the camera.
+        driver: how to start its driver so that depth is registered to colour.
+        rgb: colour topic.
+        depth: depth topic, registered to colour.
+        info: CameraInfo of colour.
+        facts: encodings and what to know.
+        source: where that is documented.
+    """
+
+    title: str
+    driver: str
+    rgb: str
+    depth: str
+    info: str
+    facts: str
+    source: str
+
+
+CAMERAS: Mapping[str, CameraTopics] = {
+    'realsense': CameraTopics(
+        'Intel RealSense D4xx',
+        'ros2 launch realsense2_camera rs_launch.py align_depth.enable:=true enable_sync:=true',
+        '/camera/camera/color/image_raw',
+        '/camera/camera/aligned_depth_to_color/image_raw',
+        '/camera/camera/color/camera_info',
+        "rgb8, 16UC1 mm; aligned depth has its colour's stamp",
+        'https://github.com/IntelRealSense/realsense-ros',
+    ),
+    'azure_kinect': CameraTopics(
+        'Azure Kinect',
+        'ros2 launch azure_kinect_ros_driver driver.launch.py color_enabled:=true',
+        '/rgb/image_raw',
+        '/depth_to_rgb/image_raw',
+        '/rgb/camera_info',
+        'bgra8, 32FC1 m or 16UC1 mm; not undistorted, rational_polynomial: colour and registered depth bend alike',
+        'https://github.com/microsoft/Azure_Kinect_ROS_Driver/blob/melodic/docs/usage.md',
+    ),
+    'orbbec': CameraTopics(
+        'Orbbec (Gemini, Femto, Astra)',
+        'ros2 launch orbbec_camera gemini_330_series.launch.py depth_registration:=true',
+        '/camera/color/image_raw',
+        '/camera/depth/image_raw',
+        '/camera/color/camera_info',
+        '16UC1 mm; without depth_registration the same topic is not registered',
+        'https://orbbec.github.io/OrbbecSDK_ROS2/en/source/4_application_guide/topics.html',
+    ),
+    'oak': CameraTopics(
+        'Luxonis OAK-D',
+        'ros2 launch depthai_ros_driver camera.launch.py',
+        '/oak/rgb/image_raw',
+        '/oak/stereo/image_raw',
+        '/oak/rgb/camera_info',
+        '16UC1 mm; pipeline type RGBD with i_align_depth; colour and depth are not exactly in step',
+        'https://docs.luxonis.com/software/ros/depthai-ros/driver',
+    ),
+    'zed': CameraTopics(
+        'Stereolabs ZED',
+        'ros2 launch zed_wrapper zed_camera.launch.py camera_model:=zed2i',
+        '/zed/zed_node/rgb/color/rect/image',
+        '/zed/zed_node/depth/depth_registered',
+        '/zed/zed_node/rgb/color/rect/camera_info',
+        'bgra8 or bgr8, 32FC1 m (16UC1 mm with openni_depth_mode); rectified; the wrapper before 5 has '
+        'rgb/image_rect_color and rgb/camera_info',
+        'https://www.stereolabs.com/docs/ros2',
+    ),
+    'tum': CameraTopics(
+        'TUM RGB-D recordings',
+        'splatam_bag_player rgbd_dataset_freiburg1_desk.bag',
+        '/camera/rgb/image_color',
+        '/camera/depth/image',
+        '/camera/rgb/camera_info',
+        'rgb8, 32FC1 m; registered, but stamped apart by up to half a frame; the frame ids of colour and depth differ',
+        'https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats',
+    ),
+}

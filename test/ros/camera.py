@@ -1,0 +1,125 @@
+"""A camera of the tests' own, and the node with settings that are fast rather than good."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from graph import Graph, Process
+from numpy.typing import NDArray
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+
+from msg_adapters import camera_info, images, stamps
+from msg_adapters.factory import RclpyMessages
+from splatam_core.datasets.synthetic import SyntheticSequence
+from splatam_core.types import RgbdFrame
+
+# These tests are about messages, not about maps: few steps, and nothing is lost that could be followed at all.
+QUICK = {
+    'tracking.iterations': 6, 'mapping.iterations': 3, 'mapping.every': 1, 'tracking.min_inlier_fraction': 0.1,
+    'threads': 1,
+}  # fmt: skip
+SLAM = {f'slam__{name.replace(".", "__")}': value for name, value in QUICK.items()}
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+MAKE = RclpyMessages()
+CAMERA_FRAME = 'camera_optical_frame'
+STREAMS = ('info', 'rgb', 'depth')
+
+
+def run_node(graph: Graph, *ros_arguments: str, **parameters: Any) -> Process:
+    return graph.run_node(*ros_arguments, **{'preset': 'quick', **SLAM, **parameters})
+
+
+def stamps_of(messages: list[Any]) -> list[int]:
+    return [stamps.message_stamp_ns(message) for message in messages]
+
+
+class Camera:
+    """A camera of the test's, sending what it is told to."""
+
+    def __init__(self, graph: Graph, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> None:
+        qos = QoSProfile(depth=100, reliability=reliability)
+        self._graph = graph
+        self._publishers = {
+            'info': graph.publisher(CameraInfo, '/rgb/camera_info', qos),
+            'rgb': graph.publisher(Image, '/rgb/image', qos),
+            'depth': graph.publisher(Image, '/depth/image', qos),
+        }
+
+    def publisher(self, stream: str) -> Publisher:
+        return self._publishers[stream]
+
+    @property
+    def is_matched(self) -> bool:
+        return all(publisher.get_subscription_count() for publisher in self._publishers.values())
+
+    def wait_matched(self) -> None:
+        self._graph.spin_until(lambda: self.is_matched)
+
+    def send(
+        self, frame: RgbdFrame, *, depth_delay_ns: int = 0, only: Sequence[str] = STREAMS, **changes: Any
+    ) -> None:
+        """Send a frame's messages, or some of them; ``rgb__encoding='x'`` changes a field of one."""
+        c, stamp = frame.camera, frame.stamp_ns
+        parameters = camera_info.CameraParameters(c.width, c.height, c.fx, c.fy, c.cx, c.cy, frame_id=CAMERA_FRAME)
+        messages = {
+            'info': camera_info.info_message(MAKE, parameters, stamp),
+            'rgb': images.color_message(MAKE, frame.rgb, stamp, CAMERA_FRAME),
+            'depth': images.depth_message(MAKE, frame.depth_m, stamp + depth_delay_ns, CAMERA_FRAME),
+        }
+        for name, value in changes.items():
+            message, _, attribute = name.partition('__')
+            setattr(messages[message], attribute, value)
+        for name in only:
+            self._publishers[name].publish(messages[name])
+
+
+class Live:
+    """A node at work, fed frame by frame by a camera; each frame is waited for until it is done with."""
+
+    def __init__(self, graph: Graph, *ros_arguments: str, **parameters: Any) -> None:
+        self.graph = graph
+        self.camera = Camera(graph)
+        self.done = graph.collect(Header, '/splatam/processed')
+        self.poses = graph.collect(PoseStamped, '/splatam/pose')
+        self.node = run_node(graph, *ros_arguments, **parameters)
+        self.wait(lambda: self.camera.is_matched)
+        self.wait(lambda: all(map(graph.node.count_publishers, ('/splatam/processed', '/splatam/pose'))))
+
+    def wait(self, condition: Callable[[], object]) -> None:
+        """Spin until it is so; a node that has ended is not waited for."""
+        self.graph.spin_until(lambda: condition() or not self.node.is_running, explain=lambda: self.node.text)
+        assert self.node.is_running, self.node.text
+
+    def wait_says(self, *parts: str) -> None:
+        self.wait(lambda: self.node.says(*parts))
+
+    def show(self, frame: RgbdFrame, **options: Any) -> PoseStamped | None:
+        """Send a frame; its pose, None if it has none."""
+        self.camera.send(frame, **options)
+        self.wait_done(frame.stamp_ns)
+        return self.pose_of(frame.stamp_ns)
+
+    def wait_done(self, stamp_ns: int) -> None:
+        self.wait(lambda: self.done and stamps.to_ns(self.done[-1].stamp) == stamp_ns)
+
+    def pose_of(self, stamp_ns: int) -> PoseStamped | None:
+        """Its pose is published before the frame is said to be done, on another topic."""
+        self.graph.spin_for(0.1)
+        return next((pose for pose in reversed(self.poses) if stamps.message_stamp_ns(pose) == stamp_ns), None)
+
+
+def position(pose: PoseStamped) -> NDArray[np.float64]:
+    p = pose.pose.position
+    return np.array([p.x, p.y, p.z])
+
+
+def still(frames: SyntheticSequence, number: int) -> RgbdFrame:
+    """A frame of a camera that does not move: nothing that could be lost."""
+    return replace(frames[0], stamp_ns=10**9 + number * 10**8)

@@ -1,0 +1,183 @@
+"""Services and run-time parameters of the running node."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from camera import Live, position, still
+from control import Control
+from graph import Graph
+
+from splatam_core.config import load_config
+from splatam_core.datasets.synthetic import SyntheticSequence
+from splatam_core.ply import read_ply, write_ply
+from splatam_core.run_folder import read_run
+from splatam_core.slam import Slam
+from splatam_core.trajectory import pose_line
+from splatam_core.types import RgbdFrame
+from splatam_ros.gate import Gate
+
+SECOND = 10**9
+# Where a camera that does not move may be found, at 64 pixels width and a handful of steps: a pixel is 4 cm at 2.5 m.
+STILL_M = 0.04
+MOVED_M = 0.08  # what tells two places apart in these tests; they are further apart than this
+
+
+def moving(frames: SyntheticSequence, number: int, view: int) -> RgbdFrame:
+    """What the camera sees at ``frames[view]``, as the frame of some time."""
+    return replace(frames[view], stamp_ns=SECOND + number * 10**8)
+
+
+def test_pause_resume_reset_and_save(graph: Graph, frames: SyntheticSequence) -> None:
+    out = graph.folder / 'run'
+    live = Live(graph, save_path=out)
+    control = Control(graph)
+    assert all(live.show(still(frames, number)) for number in range(3))
+    assert '3 frames' in control.succeed('save_map')
+    saved = read_ply(out / 'map.ply')
+    assert len(saved.means) > 500 and len(read_run(out).trajectory) == 3
+
+    assert 'let go' in control.succeed('pause') and 'already' in control.succeed('pause')
+    assert [live.show(still(frames, number)) for number in (3, 4)] == [None, None]  # answered, but not looked at
+    control.succeed('save_map')
+    assert len(read_run(out).frames) == 3 and len(read_ply(out / 'map.ply').means) == len(saved.means)
+    assert control.succeed('resume') == 'resumed' and 'not paused' in control.succeed('resume')
+    assert live.show(still(frames, 5))
+
+    assert 'previous' in control.succeed('reset')
+    later = replace(frames[6], stamp_ns=SECOND + 6 * 10**8)
+    pose = live.show(later)
+    assert pose is not None and not position(pose).any()  # a new world begins where the camera is
+    assert [len(read_run(path).trajectory) for path in (out, out / 'previous')] == [1, 4]
+    assert (out / 'previous' / 'map.ply').is_file()
+    assert live.node.says('map reset: asked for by ~/reset')
+
+
+def test_saving_elsewhere_at_run_time(graph: Graph, frames: SyntheticSequence) -> None:
+    live = Live(graph, save_root=graph.folder)
+    control = Control(graph)
+    assert live.show(still(frames, 0))
+    assert 'save_path is empty' in control.fail('save_map')
+    (refused,) = control.set(save_path=str(graph.folder.parent / 'elsewhere'))
+    assert not refused.successful and 'expected a folder below save_root' in refused.reason
+    assert 'save_path is empty' in control.fail('save_map')
+
+    for name, frame_count in (('first', 1), ('second', 2)):  # the second has the trajectory of the first
+        control.change(save_path=str(graph.folder / name))
+        control.succeed('save_map')
+        assert live.show(still(frames, frame_count))
+        control.succeed('save_map')
+        assert len(read_run(graph.folder / name).trajectory) == frame_count
+        assert read_ply(graph.folder / name / 'map.ply').means.any()
+    assert not list(graph.folder.glob('.*'))  # nothing half-made is left
+
+
+@pytest.fixture(scope='module')
+def saved_map(frames: SyntheticSequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of the recording by the paper's settings, in a file."""
+    slam = Slam(load_config('quick', {'threads': 1, 'mapping.every': 1}))
+    assert all(slam.process(frame).T_world_cam is not None for frame in frames)
+    path = tmp_path_factory.mktemp('map') / 'map.ply'
+    write_ply(path, slam.map.gaussians)
+    return path
+
+
+def test_a_saved_map_is_localised_in(graph: Graph, frames: SyntheticSequence, saved_map: Path) -> None:
+    """From the start, at the pose that is given; the map stays as it is until mapping is switched on."""
+    truth = frames.ground_truth().T_world_cam
+    near, T = (np.linalg.inv(truth[0]) @ truth[view] for view in (10, 11))
+    out = graph.folder / 'run'
+    live = Live(
+        graph, load_path=saved_map, load_pose=pose_line(0, near).partition(' ')[2], save_path=out,
+        slam__mapping__enabled=False, slam__tracking__min_inlier_fraction=0.5,
+    )  # fmt: skip
+    control = Control(graph)
+    pose = live.show(frames[11])
+    assert pose is not None and np.linalg.norm(position(pose) - T[:3, 3]) < STILL_M < np.linalg.norm(T[:3, 3])
+    control.succeed('save_map')
+    np.testing.assert_array_equal(read_ply(out / 'map.ply').means, read_ply(saved_map).means)
+
+    control.change(slam__mapping__enabled=True)
+    assert live.show(replace(frames[11], stamp_ns=20 * SECOND))
+    control.succeed('save_map')
+    assert read_ply(out / 'map.ply').means.shape != read_ply(saved_map).means.shape
+
+    control.change(load_path=str(graph.folder / 'nowhere.ply'))
+    assert 'nowhere.ply: cannot be read' in control.fail('load_map')
+    control.change(load_path=str(saved_map), load_pose='', slam__mapping__enabled=False)
+    assert str(saved_map) in control.succeed('load_map')
+    pose = live.show(replace(frames[0], stamp_ns=21 * SECOND))
+    assert pose is not None and np.linalg.norm(position(pose)) < STILL_M
+    assert [len(read_run(path).trajectory) for path in (out, out / 'previous')] == [1, 2]
+
+
+def test_localising_without_a_map_says_so(graph: Graph, frames: SyntheticSequence) -> None:
+    live = Live(graph, slam__mapping__enabled=False)
+    assert live.show(frames[0]) is None
+    assert live.node.says('lost', 'the map cannot start: mapping.enabled is off')
+
+
+@pytest.mark.parametrize('policy', ['reset', 'continue'])
+def test_time_that_jumps_back(graph: Graph, frames: SyntheticSequence, policy: str) -> None:
+    """The camera has moved by the time of the jump: in a new map it is at the origin, in the old one it is not."""
+    out = graph.folder / 'run'
+    live = Live(graph, on_time_jump=policy, save_path=out, queue_policy='all')
+    before = [live.show(moving(frames, 1000 + number, view)) for number, view in enumerate((0, 4, 8, 11))]
+    assert np.linalg.norm(position(before[-1])) > MOVED_M
+    after = [live.show(moving(frames, number, 11)) for number in range(3)]
+    assert live.node.says('time jumped back')
+    expected = np.zeros(3) if policy == 'reset' else position(before[-1])
+    for pose in after:
+        assert pose is not None and np.linalg.norm(position(pose) - expected) < STILL_M
+    # Stamps of a trajectory increase: there is one of before, and one of after.
+    assert [len(read_run(path).trajectory) for path in (out, out / 'previous')] == [3, 4]
+    # And forward: nothing is reset, nothing freezes.
+    poses = [live.show(moving(frames, 5000 + number, 11)) for number in range(2)]
+    assert np.linalg.norm(position(poses[-1]) - expected) < STILL_M
+
+
+def test_the_frame_rate_is_limited_by_stamps_and_can_be_changed(graph: Graph, frames: SyntheticSequence) -> None:
+    live = Live(graph, max_rate_hz=2.5, queue_policy='all')
+    poses = [live.show(still(frames, number)) for number in range(9)]  # at 10 Hz of stamps
+    assert [number for number, pose in enumerate(poses) if pose] == [0, 4, 8]
+    Control(graph).change(max_rate_hz=0.0)
+    assert all(live.show(still(frames, number)) for number in (9, 10))
+
+
+@pytest.mark.parametrize('jitter_ns', [0, 2_000_000, -2_000_000])
+def test_a_rate_is_kept_on_average_whatever_the_jitter(jitter_ns: int) -> None:
+    gate = Gate(max_rate_hz=10.0)
+    stamps_ns = [number * 33_333_333 + (number % 2) * jitter_ns for number in range(300)]  # 10 s at 30 Hz
+    admitted = [stamp_ns for stamp_ns in stamps_ns if gate.admits(0, stamp_ns)]
+    assert 99 <= len(admitted) <= 101
+
+
+def test_a_gate_follows_time_back() -> None:
+    gate = Gate(max_rate_hz=1.0)
+    assert gate.admits(0, 100 * SECOND) and not gate.admits(0, 100 * SECOND + 1)
+    assert gate.admits(1, 5 * SECOND) and not gate.admits(1, 5 * SECOND + 1)
+    assert gate.admits(1, 500 * SECOND) and not gate.admits(1, 500 * SECOND + 1)  # no backlog of admissions after a gap
+    gate.is_paused = True
+    assert not gate.admits(1, 600 * SECOND)
+
+
+def test_parameters_over_the_graph(graph: Graph, frames: SyntheticSequence) -> None:
+    """Refused ones change nothing; what is changed counts from the next frame on."""
+    live = Live(graph)
+    control = Control(graph)
+    assert live.show(still(frames, 0))
+    results = control.set(
+        max_rate_hz=-1.0, queue_size=0, preset='tum', slam__tracking__iterations=-3, slam__threads=4,
+        no_data_timeout=2.0,
+    )  # fmt: skip
+    assert [result.successful for result in results] == [False] * 5 + [True]
+    assert 'out of range' in results[0].reason and 'cannot change while the node runs' in results[2].reason
+    assert live.show(still(frames, 1))
+    control.change(slam__depth__min_m=50.0)  # no reading is as far as that
+    assert live.show(still(frames, 2)) is None
+    control.change(slam__depth__min_m=0.2)
+    assert live.show(still(frames, 3))
+    assert 'Traceback' not in live.node.text

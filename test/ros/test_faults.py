@@ -1,0 +1,310 @@
+"""Faults tried on the running node, and what happens."""
+
+from __future__ import annotations
+
+import resource
+import signal
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from camera import MAKE, SLAM, Camera, Live, position, run_node, still
+from control import Control
+from geometry_msgs.msg import PoseStamped
+from graph import Graph, Process, node_arguments
+from sensor_msgs.msg import CameraInfo, CompressedImage
+from std_msgs.msg import Header
+
+from msg_adapters import camera_info, images, stamps
+from splatam_core.datasets.synthetic import SyntheticSequence
+from splatam_core.ply import read_ply
+from splatam_core.run_folder import read_run
+from splatam_core.types import RgbdFrame
+
+SECOND = 10**9
+STILL_M = 0.04  # a pixel, at 64 pixels width and 2.5 m
+
+PUBLISHER = """
+import sys, time
+from dataclasses import replace
+from pathlib import Path
+sys.path.insert(0, 'test/ros')
+from camera import Camera
+from graph import Graph
+from splatam_core.datasets.synthetic import SyntheticSequence
+import os, rclpy
+from rclpy.executors import SingleThreadedExecutor
+class Here:
+    '''The graph this process was started on.'''
+    def __init__(self):
+        rclpy.init()
+        self.node = rclpy.create_node('camera')
+    def publisher(self, message_class, topic, qos):
+        return self.node.create_publisher(message_class, topic, qos)
+frame = SyntheticSequence(seed=0, noise=False, frames=12, width=64)[0]
+camera = Camera(Here())
+while True:
+    camera.send(replace(frame, stamp_ns=time.time_ns()))
+    time.sleep(0.1)
+"""
+
+
+def start_publisher(graph: Graph) -> Process:
+    """A camera in a process of its own, of a view that does not change, ten times a second."""
+    return graph.start('-c', PUBLISHER)
+
+
+def covered(frame: RgbdFrame) -> RgbdFrame:
+    """What a camera sees with a hand on it: black, and nothing to measure."""
+    return replace(frame, rgb=np.zeros_like(frame.rgb), depth_m=np.zeros_like(frame.depth_m))
+
+
+def test_a_publisher_that_is_killed_and_started_again(graph: Graph) -> None:
+    poses = graph.collect(PoseStamped, '/splatam/pose')
+    node = run_node(graph, no_data_timeout=1.0)
+    first = start_publisher(graph)
+    graph.spin_until(lambda: len(poses) >= 3, explain=lambda: node.text + first.text)
+    first.send(signal.SIGKILL)
+    # The graph notices a process that vanished only after DDS's lease of some seconds; silence is noticed at once.
+    node.wait_says('no frame for 1 s: nothing has come on /rgb/image and /depth/image')
+    before = len(poses)
+    second = start_publisher(graph)
+    graph.spin_until(lambda: len(poses) >= before + 3, explain=lambda: node.text + second.text)
+    assert np.linalg.norm(position(poses[-1])) < STILL_M  # the map is the same, and so is the camera's place in it
+    assert node.is_running and not node.says('map reset')
+
+
+def test_a_covered_camera(graph: Graph, frames: SyntheticSequence) -> None:
+    """For 3 s: no pose, the map untouched, tracking again when the view returns. With lost_reset_after: a new map."""
+    out = graph.folder / 'run'
+    live = Live(graph, save_path=out, queue_policy='all', slam__tracking__min_inlier_fraction=0.5)
+    control = Control(graph)
+    assert all(live.show(still(frames, number)) for number in range(3))
+    control.succeed('save_map')
+    before = (out / 'map.ply').read_bytes()
+    assert not any(live.show(covered(still(frames, number))) for number in range(3, 33, 3))
+    assert live.node.says('lost at')
+    control.succeed('save_map')
+    assert (out / 'map.ply').read_bytes() == before
+    pose = live.show(still(frames, 33))
+    assert pose is not None and np.linalg.norm(position(pose)) < STILL_M
+    assert not live.node.says('map reset')
+
+    control.change(lost_reset_after=0.5)
+    assert not any(live.show(covered(still(frames, number))) for number in range(40, 47))
+    live.wait_says('map reset', 'lost for 0.5 s')
+    pose = live.show(still(frames, 50))
+    assert pose is not None and not position(pose).any()
+    assert len(read_run(out / 'previous').lost_ns) == 10 + 6  # the frames after the reset are of the new run
+
+
+def test_depth_that_stops_and_comes_back(graph: Graph, frames: SyntheticSequence) -> None:
+    live = Live(graph, no_data_timeout=1.0, sync__mode='exact', sync__queue_size=3)
+    assert live.show(still(frames, 0))
+    sent = iter(range(1, 10**6))
+
+    def only_colour() -> bool:
+        live.camera.send(still(frames, next(sent)), only=('info', 'rgb'))
+        graph.spin_for(0.05)
+        return live.node.says('no frame for 1 s: nothing has come on /depth/image for', 'though published')
+
+    live.wait(only_colour)
+    assert live.node.says('dropped: (colour) without depth', 'the newest depth is -')
+    assert live.show(still(frames, next(sent)))
+
+
+def test_camera_info_that_is_late(graph: Graph, frames: SyntheticSequence) -> None:
+    live = Live(graph, no_data_timeout=1.0, sync__queue_size=3, queue_policy='all')
+    for number in range(6):
+        live.camera.send(still(frames, number), only=('rgb', 'depth'))
+    live.wait_says('no frame for 1 s: /rgb/camera_info is published, but no message has come')
+    live.wait_says('dropped: with depth, but no CameraInfo has come')
+    assert not live.done
+    live.camera.send(still(frames, 6), only=('info',))  # as many as fit the queue have waited for it
+    live.wait_done(still(frames, 5).stamp_ns)
+    assert [stamps.to_ns(header.stamp) for header in live.done] == [still(frames, n).stamp_ns for n in (3, 4, 5)]
+    assert live.show(still(frames, 7))
+
+
+def test_one_message_in_ten_is_lost(graph: Graph, frames: SyntheticSequence) -> None:
+    """Every frame both of whose images arrived has its pose; the others are told."""
+    rng = np.random.default_rng(1)
+    live = Live(graph, queue_policy='all', sync__mode='exact')
+    live.show(still(frames, 0))
+    expected = []
+    for number in range(1, 61):
+        arriving = [stream for stream in ('info', 'rgb', 'depth') if rng.random() >= 0.1]
+        live.camera.send(still(frames, number), only=arriving)
+        if {'rgb', 'depth'} <= set(arriving):
+            expected.append(still(frames, number).stamp_ns)
+    live.wait_done(expected[-1])
+    assert 40 < len(expected) < 60  # some are lost indeed
+    assert [stamps.to_ns(header.stamp) for header in live.done][1:] == expected
+    live.wait_says('dropped: (colour) without depth')
+    live.wait(lambda: len(live.poses) > len(expected))
+    assert [stamps.message_stamp_ns(pose) for pose in live.poses][1:] == expected
+
+
+def test_corrupted_compressed_frames(graph: Graph, frames: SyntheticSequence) -> None:
+    """Bytes flipped or cut off: a warning or a wrong picture, never the end; good frames go on."""
+    rng = np.random.default_rng(2)
+    publishers = {
+        'info': graph.publisher(CameraInfo, '/rgb/camera_info'),
+        'rgb': graph.publisher(CompressedImage, '/rgb/image/compressed'),
+        'depth': graph.publisher(CompressedImage, '/depth/image/compressedDepth'),
+    }
+    poses, done = graph.collect(PoseStamped, '/splatam/pose'), graph.collect(Header, '/splatam/processed')
+    node = run_node(
+        graph, rgb_transport='compressed', depth_transport='compressedDepth', queue_policy='all',
+        slam__tracking__min_inlier_fraction=0.5,
+    )  # fmt: skip
+    graph.spin_until(lambda: all(p.get_subscription_count() for p in publishers.values()) and
+                     graph.node.count_publishers('/splatam/pose'), explain=lambda: node.text)  # fmt: skip
+
+    def send(number: int, damage: Any = None) -> int:
+        frame = still(frames, number)
+        c = frame.camera
+        parameters = camera_info.CameraParameters(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
+        messages = {
+            'info': camera_info.info_message(MAKE, parameters, frame.stamp_ns),
+            'rgb': images.compressed_color_message(MAKE, frame.rgb, frame.stamp_ns, ''),
+            'depth': images.compressed_depth_message(MAKE, frame.depth_m, frame.stamp_ns, ''),
+        }
+        if damage is not None:
+            damage(messages)
+        for name, publisher in publishers.items():
+            publisher.publish(messages[name])
+        return frame.stamp_ns
+
+    def flip(messages: dict[str, Any]) -> None:
+        for name in ('rgb', 'depth'):
+            for at in rng.integers(0, len(messages[name].data), 8):
+                messages[name].data[at] ^= int(rng.integers(1, 256))
+
+    def cut(messages: dict[str, Any]) -> None:
+        for name in ('rgb', 'depth'):
+            messages[name].data = messages[name].data[: int(rng.integers(0, len(messages[name].data)))]
+
+    def has_pose(stamp_ns: int) -> bool:
+        assert node.is_running, node.text
+        return any(stamps.message_stamp_ns(pose) == stamp_ns for pose in poses)
+
+    first = send(0)
+    graph.spin_until(lambda: has_pose(first), explain=lambda: node.text)
+    for number in range(1, 41):
+        send(number, flip if number % 2 else cut)
+    last = send(41)
+    graph.spin_until(lambda: has_pose(last), explain=lambda: node.text)
+    assert node.says('colour left out', 'truncated or damaged') and 'Traceback' not in node.text
+    assert len(done) < 42  # damage was noticed
+    assert np.linalg.norm(position(poses[-1])) < STILL_M
+
+
+def test_a_stamp_that_jumps_and_returns(graph: Graph, frames: SyntheticSequence) -> None:
+    """One message far in the future, and one in the past: what comes after them is tracked, nothing freezes."""
+    live = Live(graph, on_time_jump='continue', queue_policy='all')
+    assert live.show(still(frames, 0))
+    for wrong_ns in (10**6 * SECOND, SECOND // 2):
+        live.camera.send(replace(frames[0], stamp_ns=wrong_ns))
+        numbers = iter(range(1, 100))
+        graph.spin_for(0.2)
+        live.wait(lambda: _shows_pose(live, still(frames, next(numbers))))  # noqa: B023
+    assert np.linalg.norm(position(live.poses[-1])) < STILL_M
+
+
+def _shows_pose(live: Live, frame: RgbdFrame) -> bool:
+    live.camera.send(frame)
+    return live.pose_of(frame.stamp_ns) is not None
+
+
+# --- saving ---
+
+
+def limit_file_size(node: Process, num_bytes: int) -> None:
+    """Writing a file beyond this fails, as on a full disk."""
+    resource.prlimit(node.pid, resource.RLIMIT_FSIZE, (num_bytes, resource.RLIM_INFINITY))
+
+
+def test_a_disk_that_is_full(graph: Graph, frames: SyntheticSequence) -> None:
+    """Saving fails with the reason, the file of before stays whole, SLAM goes on; with room again all is saved.
+
+    That a frame could not be written down is said too, but here the node's log is on the full disk as well.
+    """
+    out = graph.folder / 'run'
+    live = Live(graph, save_path=out, queue_policy='all')
+    control = Control(graph)
+    assert live.show(still(frames, 0))
+    control.succeed('save_map')
+    before = (out / 'map.ply').read_bytes()
+    assert live.show(still(frames, 1))
+    limit_file_size(live.node, 50)  # not even a line of the trajectory
+    assert 'File too large' in control.fail('save_map')
+    assert all(live.show(still(frames, number)) for number in range(2, 6))
+    assert len(read_run(out).trajectory) == 2
+    assert (out / 'map.ply').read_bytes() == before and read_ply(out / 'map.ply').means.any()
+    limit_file_size(live.node, resource.RLIM_INFINITY)
+    assert live.show(still(frames, 6))
+    assert '7 frames' in control.succeed('save_map')
+    assert (out / 'map.ply').read_bytes() != before and not list(out.glob('.*'))
+    assert len(read_run(out).trajectory) == 7  # what could not be written then is written now
+    live.node.send(signal.SIGINT)
+    assert live.node.wait() == 0
+
+
+SLOW_DISK = """
+import os, sys, time
+from pathlib import Path
+replace = os.replace
+def slow(source, target):
+    if Path(target).name == 'map.ply' and Path(target).exists():
+        print('about to replace', target)
+        time.sleep(60)
+    replace(source, target)
+os.replace = slow
+from splatam_ros.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_node_killed_while_it_saves(graph: Graph, frames: SyntheticSequence) -> None:
+    """The file of before stays whole, and the next run can take the folder over."""
+    out = graph.folder / 'run'
+    camera, done = Camera(graph), graph.collect(Header, '/splatam/processed')
+    node = graph.start('-c', SLOW_DISK, *node_arguments(preset='quick', save_path=out, **SLAM))
+    camera.wait_matched()
+    control = Control(graph)
+    for count in (1, 2):
+        camera.send(still(frames, count))
+        graph.spin_until(lambda: len(done) == count, explain=lambda: node.text)  # noqa: B023
+        if count == 1:
+            control.succeed('save_map')
+    before = (out / 'map.ply').read_bytes()
+    node.send(signal.SIGTERM)  # which saves
+    node.wait_says('about to replace')
+    node.send(signal.SIGKILL)
+    assert node.wait() == -signal.SIGKILL
+    assert (out / 'map.ply').read_bytes() == before and read_ply(out / 'map.ply').means.any()
+    assert len(read_run(out).trajectory) == 2
+    assert [path.name for path in out.glob('.*')] == [f'.map.ply.{node.pid}']
+
+    again = run_node(graph, save_path=out, overwrite=True)
+    again.wait_says('waiting for')
+    again.send(signal.SIGINT)
+    assert again.wait() == 0 and not list(out.glob('.*'))
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'message'),
+    [
+        ({'max_rate_hz': -1.0}, 'max_rate_hz = -1.0: expected a number at least 0 and at most 1000 (Hz)'),
+        ({'slam.depth.min_m': -2.0}, 'depth.min_m = -2.0: expected a number at least 0 (m)'),
+        ({'load_path': '/nowhere.ply'}, '/nowhere.ply: cannot be read'),
+        ({'load_path': '/nowhere.ply', 'load_pose': "'1 2'"}, "expected 'x y z qx qy qz qw'"),
+    ],
+)
+def test_a_start_with_parameters_that_cannot_be_used(graph: Graph, parameters: dict[str, Any], message: str) -> None:
+    node = graph.run_node(**parameters)
+    assert node.wait() == 2, node.text
+    errors = [line for line in node.lines if 'error:' in line]
+    assert len(errors) == 1 and message in errors[0] and 'Traceback' not in node.text, node.text

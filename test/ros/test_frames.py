@@ -1,0 +1,353 @@
+"""Frames by REP 105 over DDS: what the node says on TF, what it hears there, and odometry to start from."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from camera import CAMERA_FRAME, LATCHED, MAKE, SLAM, Camera, run_node, still
+from geometry_msgs.msg import PoseStamped
+from graph import Graph, Process, node_arguments
+from nav_msgs.msg import Odometry
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
+
+from msg_adapters import point_clouds, poses, stamps
+from splatam_core import se3
+from splatam_core.config import load_config
+from splatam_core.datasets.synthetic import SyntheticSequence
+from splatam_core.errors import ConfigError
+from splatam_core.slam import Slam
+from splatam_core.types import Status
+from splatam_ros.frames import T_BODY_OPTICAL, Frames, parse_pose
+from splatam_ros.parameters import NODE_SETTINGS, NodeOptions
+from splatam_ros.throttled_warnings import ThrottledWarnings
+from splatam_ros.transforms import TransformTree
+
+# A camera 20 cm ahead of the robot's centre and 50 cm above it, looking forward and 0.2 rad down.
+CAMERA_IN_BASE = f'0.2 0 0.5 {-np.pi / 2 - 0.2} 0 {-np.pi / 2}'
+T_BASE_CAMERA = parse_pose('test', CAMERA_IN_BASE)
+TF = QoSProfile(depth=100)
+EXACT = 1e-9  # matrices to quaternions and back, and products of them, in float64
+
+
+class Ears:
+    """What a robot hears of the node."""
+
+    def __init__(self, graph: Graph, tf_message: type | None = None) -> None:
+        self.poses = graph.collect(PoseStamped, '/splatam/pose')
+        self.odometry = graph.collect(Odometry, '/splatam/odometry')
+        self.done = graph.collect(Header, '/splatam/processed')
+        self._moving = graph.collect(tf_message, '/tf', TF) if tf_message else []
+        self._fixed = graph.collect(tf_message, '/tf_static', LATCHED) if tf_message else []
+
+    @property
+    def moving(self) -> dict[tuple[str, str], dict[int, np.ndarray]]:
+        return links(self._moving)
+
+    @property
+    def fixed(self) -> dict[tuple[str, str], dict[int, np.ndarray]]:
+        return links(self._fixed)
+
+
+def links(messages: list[Any]) -> dict[tuple[str, str], dict[int, np.ndarray]]:
+    """Transforms by (parent, child), and then by stamp."""
+    found: dict[tuple[str, str], dict[int, np.ndarray]] = {}
+    for transform in itertools.chain.from_iterable(message.transforms for message in messages):
+        link = transform.header.frame_id, transform.child_frame_id
+        found.setdefault(link, {})[stamps.message_stamp_ns(transform)] = poses.transform_matrix(transform.transform)
+    return found
+
+
+def by_stamp(messages: list[Any]) -> dict[int, np.ndarray]:
+    return {
+        stamps.message_stamp_ns(message): poses.pose_matrix(getattr(message.pose, 'pose', message.pose))
+        for message in messages
+    }
+
+
+def static_message(tf_message: type, *transforms: tuple[str, str, np.ndarray]) -> Any:
+    return tf_message(transforms=[poses.transform_stamped(MAKE, T, 0, *names) for *names, T in transforms])
+
+
+def process(graph: Graph, node: Process, camera: Camera, ears: Ears, sequence: Any) -> list[int]:
+    """Send frames, each when the one before is done; their stamps."""
+    camera.wait_matched()
+    sent = []
+    for frame in sequence:
+        camera.send(frame)
+        sent.append(frame.stamp_ns)
+        graph.spin_until(lambda: ears.done and stamps.to_ns(ears.done[-1].stamp) == sent[-1], explain=lambda: node.text)
+    return sent
+
+
+def assert_close(found: np.ndarray, expected: np.ndarray) -> None:
+    np.testing.assert_allclose(found, expected, atol=EXACT)
+
+
+def test_an_upright_robot_with_its_extrinsic_as_a_parameter(
+    graph: Graph, tf_message: type, frames: SyntheticSequence
+) -> None:
+    camera, ears = Camera(graph), Ears(graph, tf_message)
+    clouds = graph.collect(PointCloud2, '/splatam/map/points', LATCHED)
+    node = run_node(
+        graph, '-p', f'camera_in_base:="{CAMERA_IN_BASE}"', base_frame='base_link', world_up='z_up', queue_policy='all',
+    )  # fmt: skip
+    graph.spin_until(lambda: graph.node.count_publishers('/tf') and graph.node.count_publishers('/tf_static'),
+                     explain=lambda: node.text)  # fmt: skip
+    sent = process(graph, node, camera, ears, list(frames)[:4])
+    odom_base, map_odom = ('odom', 'base_link'), ('map', 'odom')
+    graph.spin_until(lambda: len(ears.odometry) == 4 and ears.fixed and sent[-1] in ears.moving.get(odom_base, {}))
+
+    assert ears.moving.keys() == {map_odom, odom_base} and ears.fixed.keys() == {('base_link', CAMERA_FRAME)}
+    (T_base_camera,) = ears.fixed['base_link', CAMERA_FRAME].values()
+    assert_close(T_base_camera, T_BASE_CAMERA)
+    slam = Slam(load_config('quick', {name.removeprefix('slam__').replace('__', '.'): v for name, v in SLAM.items()}))
+    for frame, stamp_ns in zip(frames, sent):
+        T_world_cam = slam.process(frame).T_world_cam
+        # The map begins where the base began, so the robot drives on its floor.
+        T_map_base = T_BASE_CAMERA @ T_world_cam @ se3.inverse(T_BASE_CAMERA)
+        assert_close(by_stamp(ears.odometry)[stamp_ns], T_map_base)
+        assert_close(by_stamp(ears.poses)[stamp_ns], T_BASE_CAMERA @ T_world_cam)
+        for T in (ears.moving[map_odom].get(stamp_ns), np.eye(4)):
+            assert T is None or (np.eye(4) == T).all()
+        if stamp_ns in ears.moving[odom_base]:  # the subscription may be discovered after the first frames
+            assert_close(ears.moving[odom_base][stamp_ns], T_map_base)
+    assert {(m.header.frame_id, m.child_frame_id) for m in ears.odometry} == {('map', 'base_link')}
+
+    graph.spin_until(lambda: clouds and stamps.message_stamp_ns(clouds[-1]) == sent[-1])
+    points, _ = point_clouds.read_cloud(clouds[-1])
+    means = slam.snapshot().means @ T_BASE_CAMERA[:3, :3].T + T_BASE_CAMERA[:3, 3]
+    np.testing.assert_allclose(points, means, atol=1e-5)  # float32, metres
+
+
+def test_an_extrinsic_on_tf_static_is_waited_for(graph: Graph, tf_message: type, frames: SyntheticSequence) -> None:
+    camera, ears = Camera(graph), Ears(graph, tf_message)
+    node = run_node(graph, base_frame='base_link', odom_frame='""', queue_policy='all')
+    first = process(graph, node, camera, ears, [still(frames, 0)])
+    node.wait_says('WARN', "nothing is published: where 'camera_optical_frame' is in 'base_link' is not known",
+                   "no transform connects 'camera_optical_frame' to 'base_link'")  # fmt: skip
+    assert not (ears.poses or ears.odometry)
+
+    T_base_link, T_link_camera = T_BASE_CAMERA @ se3.inverse(T_BODY_OPTICAL), T_BODY_OPTICAL
+    robot = graph.publisher(tf_message, '/tf_static', LATCHED)
+    robot.publish(static_message(
+        tf_message, ('base_link', 'camera_link', T_base_link), ('camera_link', CAMERA_FRAME, T_link_camera)
+    ))  # fmt: skip
+    numbers = itertools.count(1)
+
+    def go_on() -> bool:
+        process(graph, node, camera, ears, [still(frames, next(numbers))])
+        return bool(ears.odometry)
+
+    graph.spin_until(go_on, explain=lambda: node.text)
+    graph.spin_until(lambda: ears.moving, explain=lambda: node.text)
+    assert first[0] not in by_stamp(ears.poses)
+    assert ears.moving.keys() == {('map', 'base_link')}
+    assert ears.fixed.keys() == {('base_link', 'camera_link'), ('camera_link', CAMERA_FRAME)}  # the robot's, not ours
+    for stamp_ns, T_map_base in by_stamp(ears.odometry).items():
+        assert_close(T_map_base @ T_BASE_CAMERA, by_stamp(ears.poses)[stamp_ns])
+
+
+def test_a_camera_with_a_parent_gets_no_second_one(graph: Graph, tf_message: type, frames: SyntheticSequence) -> None:
+    camera, ears = Camera(graph), Ears(graph, tf_message)
+    driver = graph.publisher(tf_message, '/tf_static', LATCHED)
+    driver.publish(static_message(
+        tf_message, ('camera_link', 'camera', np.eye(4)), ('camera', CAMERA_FRAME, np.eye(4))
+    ))  # fmt: skip
+    node = run_node(graph, queue_policy='all')
+    graph.spin_until(lambda: driver.get_subscription_count() == 2, explain=lambda: node.text)  # the test's, the node's
+    graph.spin_for(0.5)  # a latched message has no answer
+    process(graph, node, camera, ears, [still(frames, number) for number in range(2)])
+    node.wait_says('WARN', "'camera_optical_frame' is fixed to 'camera' by", "set base_frame to 'camera_link'")
+    graph.spin_until(lambda: len(ears.odometry) == 2)
+    assert ears.odometry[-1].child_frame_id == CAMERA_FRAME  # everything else works
+    assert not ears.moving
+
+
+def test_without_base_and_without_odom_frame_the_camera_is_in_the_map(
+    graph: Graph, tf_message: type, frames: SyntheticSequence
+) -> None:
+    camera, ears = Camera(graph), Ears(graph, tf_message)
+    node = run_node(
+        graph, queue_policy='all', camera_frame='eye', world_up='z_up', map_frame='world', odom_frame='drifting'
+    )
+    graph.spin_until(lambda: graph.node.count_publishers('/tf'), explain=lambda: node.text)
+    sent = process(graph, node, camera, ears, list(frames)[:3])
+    graph.spin_until(lambda: sent[-1] in ears.moving.get(('drifting', 'eye'), {}))
+    assert ears.moving.keys() == {('world', 'drifting'), ('drifting', 'eye')} and not ears.fixed
+    first = by_stamp(ears.poses)[sent[0]]
+    assert_close(first[:3, :3] @ [0, 0, 1], np.array([1, 0, 0]))  # looks along the map's x
+    assert_close(first[:3, :3] @ [0, -1, 0], np.array([0, 0, 1]))  # its top is up
+    assert {message.header.frame_id for message in ears.poses} == {'world'}
+
+
+WITHOUT_TF2 = """
+import sys
+sys.modules['tf2_msgs'] = None
+from splatam_ros.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_without_tf2_one_warning_and_all_else_works(graph: Graph, frames: SyntheticSequence) -> None:
+    camera, ears = Camera(graph), Ears(graph)
+    arguments = node_arguments(
+        '-p', f'camera_in_base:="{CAMERA_IN_BASE}"', preset='quick', queue_policy='all', base_frame='base_link',
+        **SLAM,
+    )  # fmt: skip
+    node = graph.start('-c', WITHOUT_TF2, *arguments)
+    sent = process(graph, node, camera, ears, list(frames)[:3])
+    graph.spin_until(lambda: len(ears.odometry) == len(ears.poses) == 3, explain=lambda: node.text)
+    warnings = [line for line in node.lines if 'WARN' in line]
+    assert len(warnings) == 1 and 'tf2_msgs is not installed' in warnings[0]
+    assert_close(by_stamp(ears.odometry)[sent[-1]] @ T_BASE_CAMERA, by_stamp(ears.poses)[sent[-1]])
+    assert graph.node.count_publishers('/tf') == 0
+
+
+def test_publish_tf_off_is_silent_on_tf(graph: Graph, tf_message: type, frames: SyntheticSequence) -> None:
+    camera, ears = Camera(graph), Ears(graph)
+    node = run_node(graph, publish_tf=False, queue_policy='all')
+    process(graph, node, camera, ears, [still(frames, 0)])
+    assert graph.node.count_publishers('/tf') == graph.node.count_publishers('/tf_static') == 0
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'message'),
+    [
+        ({'camera_in_base': '1 2 3', 'base_frame': 'base_link'}, "camera_in_base = '1 2 3': expected 'x y z"),
+        ({'camera_in_base': CAMERA_IN_BASE}, "camera_in_base is set, but base_frame is ''"),
+        ({'odom_source': 'tf', 'odom_frame': ''}, "odom_frame is '', but odom.source is tf"),
+        ({'odom_frame': 'map'}, "['map', 'map']; map_frame is needed, and all differ"),
+        ({'map_frame': ''}, "['odom']; map_frame is needed, and all differ"),
+    ],
+)
+def test_frames_that_contradict_each_other_are_refused(graph: Graph, parameters: dict[str, str], message: str) -> None:
+    defaults = {setting.name.replace('.', '_'): setting.default for setting in NODE_SETTINGS}
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        Frames(NodeOptions(**{**defaults, **parameters}), TransformTree(), ThrottledWarnings(graph.node.get_logger()))
+
+
+def test_such_a_refusal_is_one_line(graph: Graph) -> None:
+    node = graph.run_node('-p', 'camera_in_base:="1 2 3"', base_frame='base_link')
+    assert node.wait() == 2
+    errors = [line for line in node.lines if 'error:' in line]
+    assert len(errors) == 1 and "camera_in_base = '1 2 3'" in errors[0] and 'Traceback' not in node.text
+
+
+# --- odometry to start tracking from ---
+
+EVERY = 15  # frames of the walk: 10° and 13 cm between two images, more than a tracker finds by itself
+FAST = {'mapping.iterations': 10, 'mapping.every': 1, 'threads': 1}
+T_ODOM_START = se3.exp(np.array([3.0, -1.0, 0.2, 0.1, -0.2, 0.7]))  # odometry began elsewhere
+DRIFT_PER_S = np.array([0.01, 0.005, 0, 0, 0, 0.01])
+
+
+class Robot:
+    """A robot that runs fast, and its drifting odometry."""
+
+    def __init__(self, room: Callable[..., SyntheticSequence]) -> None:
+        sequence = room(frames=4 * EVERY + 1, width=96, noise=False)
+        truth = sequence.ground_truth()
+        self._truth = dict(zip(truth.stamps_ns.tolist(), truth.T_world_cam))
+        self.frames = [sequence[number] for number in range(0, len(sequence), EVERY)]
+        self.stamps_ns = list(self._truth)
+        self.start_ns = self.frames[0].stamp_ns
+
+    def true_pose(self, stamp_ns: int) -> np.ndarray:
+        """``T_world_cam``; the first camera is the world."""
+        return se3.inverse(self._truth[self.start_ns]) @ self._truth[stamp_ns]
+
+    def odometry(self, stamp_ns: int) -> np.ndarray:
+        """``T_odom_base``: true motion, and drift that grows with time."""
+        drift = se3.exp(DRIFT_PER_S * (stamp_ns - self.start_ns) * 1e-9)
+        return T_ODOM_START @ T_BASE_CAMERA @ self.true_pose(stamp_ns) @ drift @ se3.inverse(T_BASE_CAMERA)
+
+    def prior(self, from_ns: int, to_ns: int) -> np.ndarray:
+        T_odom_from, T_odom_to = (self.odometry(stamp_ns) @ T_BASE_CAMERA for stamp_ns in (from_ns, to_ns))
+        return se3.inverse(T_odom_from) @ T_odom_to
+
+    def error_m(self, stamp_ns: int, T_world_cam: np.ndarray) -> float:
+        return float(np.linalg.norm(T_world_cam[:3, 3] - self.true_pose(stamp_ns)[:3, 3]))
+
+
+@pytest.fixture(scope='session')
+def robot(room: Callable[..., SyntheticSequence]) -> Robot:
+    return Robot(room)
+
+
+TRACKED_M = 0.03  # twice what these 96 pixels give with perfect odometry
+ASTRAY_M = 0.1  # without odometry the second frame is off by 15 cm
+
+
+def test_slam_starts_from_the_prior(robot: Robot) -> None:
+    for prior, is_tracked in ((robot.prior, True), (None, False), (lambda from_ns, to_ns: None, False)):
+        slam = Slam(load_config('quick', FAST), prior)
+        results = [slam.process(frame) for frame in robot.frames]
+        errors_m = [
+            np.inf if result.status is Status.LOST else robot.error_m(result.stamp_ns, result.T_world_cam)
+            for result in results
+        ]
+        assert max(errors_m) < TRACKED_M if is_tracked else max(errors_m) > ASTRAY_M, errors_m
+
+
+@pytest.mark.parametrize('source', ['tf', 'topic'])
+def test_odometry_is_where_tracking_starts_and_is_corrected(
+    graph: Graph, tf_message: type, robot: Robot, source: str
+) -> None:
+    camera, ears = Camera(graph), Ears(graph, tf_message)
+    wheels = graph.publisher(tf_message, '/tf', TF) if source == 'tf' else graph.publisher(Odometry, '/odom')
+    slam = {f'slam.{name}': value for name, value in FAST.items()}
+    node = graph.run_node(
+        '-p', f'camera_in_base:="{CAMERA_IN_BASE}"',
+        **{'preset': 'quick', 'odom.source': source, 'base_frame': 'base_link', 'queue_policy': 'all', **slam},
+    )  # fmt: skip
+    graph.spin_until(lambda: wheels.get_subscription_count() >= 1 + (source == 'tf'), explain=lambda: node.text)
+    graph.spin_until(lambda: graph.node.count_publishers('/tf') >= 1 + (source == 'tf'), explain=lambda: node.text)
+
+    for stamp_ns in robot.stamps_ns[::2]:  # the images' stamps are between these
+        T = robot.odometry(stamp_ns)
+        if source == 'tf':
+            transform = poses.transform_stamped(MAKE, T, stamp_ns, 'odom', 'base_link')
+            wheels.publish(tf_message(transforms=[transform]))
+        else:
+            zeros = np.zeros((6, 6))
+            wheels.publish(poses.odometry(
+                MAKE, T, stamp_ns, 'odom', 'base_link', pose_covariance=zeros, twist=zeros[0], twist_covariance=zeros
+            ))  # fmt: skip
+    sent = process(graph, node, camera, ears, robot.frames)
+    map_odom = 'map', 'odom'
+    graph.spin_until(lambda: len(ears.odometry) == len(sent) and sent[-1] in ears.moving.get(map_odom, {}),
+                     explain=lambda: node.text)  # fmt: skip
+    assert 'WARN' not in node.text
+    for stamp_ns, T_world_cam in by_stamp(ears.poses).items():
+        assert robot.error_m(stamp_ns, T_world_cam) < TRACKED_M
+    # Map to odom to base is where the base is, though the odometry drifts; the node does not say odom to base again.
+    T_map_base = by_stamp(ears.odometry)
+    for stamp_ns, T_map_odom in ears.moving[map_odom].items():
+        # Odometry between two of its poses is interpolated along a screw; the walk is nearly that over 0.07 s.
+        np.testing.assert_allclose(T_map_odom @ robot.odometry(stamp_ns), T_map_base[stamp_ns], atol=2e-3)
+    assert set(ears.moving.get(('odom', 'base_link'), {})) <= set(robot.stamps_ns[::2])
+
+
+def test_without_odometry_constant_velocity_and_one_warning(
+    graph: Graph, tf_message: type, frames: SyntheticSequence
+) -> None:
+    camera, ears = Camera(graph), Ears(graph, tf_message)
+    wheels = graph.publisher(Odometry, '/odom')
+    node = run_node(graph, queue_policy='all', odom__source='topic', odom__max_wait=0.05)
+    graph.spin_until(wheels.get_subscription_count, explain=lambda: node.text)
+    elsewhere = poses.odometry(
+        MAKE, np.eye(4), 1, 'vio', 'camera', pose_covariance=np.eye(6), twist=np.zeros(6), twist_covariance=np.eye(6)
+    )
+    wheels.publish(elsewhere)
+    process(graph, node, camera, ears, [still(frames, number) for number in range(4)])
+    graph.spin_until(lambda: len(ears.poses) == 4, explain=lambda: node.text)
+    assert len([line for line in node.lines if 'constant velocity instead' in line]) == 1
+    assert node.says('WARN', "/odom is in the frame 'vio', but odom_frame is 'odom'; set it to 'vio'")
+    assert not ears.moving  # the correction of an odometry that is not known is not known

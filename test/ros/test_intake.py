@@ -1,0 +1,241 @@
+"""From messages to frames: sizes, rectification, cameras that change, and what is said about input that may not fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from camera import CAMERA_FRAME, MAKE, Live, position, still
+from graph import Graph
+from sensor_msgs.msg import CameraInfo
+
+from msg_adapters import camera_info, images
+from msg_adapters.camera_info import CameraParameters
+from splatam_core.datasets.synthetic import SyntheticSequence
+from splatam_core.types import RgbdFrame
+from splatam_ros.gate import Gate
+from splatam_ros.intake import Intake
+from splatam_ros.parameters import NODE_SETTINGS, NodeOptions
+from splatam_ros.throttled_warnings import ThrottledWarnings
+
+SECOND = 10**9
+PARAMETERS = CameraParameters(64, 48, 55.0, 55.0, 31.5, 23.5, frame_id=CAMERA_FRAME)
+RGB = np.zeros((48, 64, 3), np.uint8)
+DEPTH = np.full((48, 64), 2.0, np.float32)
+STILL_M = 0.04  # a pixel, at 64 pixels width and 2.5 m
+
+
+@dataclass
+class Bench:
+    """An intake, and what it says."""
+
+    intake: Intake
+    gate: Gate
+    skipped: list[int]
+    said: Callable[[], str]
+
+    def feed(
+        self, stamp_ns: int, *, info: CameraInfo | None = None, rgb: Any = RGB, depth_m: Any = DEPTH,
+        depth_delay_ns: int = 0, depth_frame: str = CAMERA_FRAME,
+    ) -> list[RgbdFrame]:  # fmt: skip
+        frames = self.intake.info(info or camera_info.info_message(MAKE, PARAMETERS, stamp_ns))
+        frames += self.intake.color(images.color_message(MAKE, rgb, stamp_ns, CAMERA_FRAME))
+        return frames + self.intake.depth(images.depth_message(MAKE, depth_m, stamp_ns + depth_delay_ns, depth_frame))
+
+
+@pytest.fixture
+def make_bench(graph: Graph, capfd: pytest.CaptureFixture[str]) -> Callable[..., Bench]:
+    text = ['']
+
+    def said() -> str:
+        text[0] += ''.join(capfd.readouterr())
+        return text[0]
+
+    def make(**options: Any) -> Bench:
+        defaults = {setting.name.replace('.', '_'): setting.default for setting in NODE_SETTINGS}
+        gate, skipped = Gate(options.get('max_rate_hz', 0.0)), []
+        warnings = ThrottledWarnings(graph.node.get_logger())
+        intake = Intake(NodeOptions(**{**defaults, **options}), warnings, gate, skipped.append)
+        return Bench(intake, gate, skipped, said)
+
+    return make
+
+
+def info(**changes: Any) -> CameraInfo:
+    message = camera_info.info_message(MAKE, PARAMETERS, SECOND)
+    for name, value in changes.items():
+        setattr(message, name, value)
+    return message
+
+
+def test_binning_and_region_of_interest_are_applied(make_bench: Callable[..., Bench]) -> None:
+    """A 160x120 camera, of which the driver sends every second pixel of 128x96 at (16, 12)."""
+    message = info(
+        width=160, height=120, binning_x=2, binning_y=2,
+        k=[110.0, 0.0, 79.5, 0.0, 110.0, 59.5, 0.0, 0.0, 1.0],
+    )  # fmt: skip
+    message.roi.x_offset, message.roi.y_offset, message.roi.width, message.roi.height = 16, 12, 128, 96
+    (frame,) = make_bench().feed(SECOND, info=message)
+    c = frame.camera
+    assert (c.width, c.height, c.fx, c.fy, c.cx, c.cy) == (64, 48, 55.0, 55.0, 31.5, 23.5)
+
+
+COEFFICIENTS = [
+    ('plumb_bob', [-0.2, 0.05, 0.001, -0.001, 0.0]),
+    ('rational_polynomial', [0.3, 0.1, 0.0, 0.0, 0.02, 0.5, 0.1, 0.01]),
+    ('equidistant', [0.1, -0.02, 0.0, 0.0]),
+]
+
+
+@pytest.mark.parametrize(('model', 'd'), COEFFICIENTS)
+def test_images_are_rectified_unless_they_are_already(
+    make_bench: Callable[..., Bench], model: str, d: list[float]
+) -> None:
+    rgb = np.dstack([np.tile(np.arange(64, dtype=np.uint8) * 4, (48, 1))] * 3)
+    message = info(distortion_model=model, d=d, p=np.array([50.0, 0, 30, 0, 0, 50, 20, 0, 0, 0, 1, 0]))
+    (rectified,) = make_bench().feed(SECOND, info=message, rgb=rgb)
+    (as_it_was,) = make_bench(undistort=False).feed(SECOND, info=message, rgb=rgb)
+    assert (rectified.camera.fx, as_it_was.camera.fx, as_it_was.camera.cx) == (55.0, 50.0, 30.0)
+    np.testing.assert_array_equal(as_it_was.rgb, rgb)
+    k = np.array(message.k).reshape(3, 3)
+    if model == 'equidistant':
+        maps = cv2.fisheye.initUndistortRectifyMap(k, np.array(d), np.eye(3), k, (64, 48), cv2.CV_32FC1)
+    else:
+        maps = cv2.initUndistortRectifyMap(k, np.array(d), np.eye(3), k, (64, 48), cv2.CV_32FC1)
+    np.testing.assert_array_equal(rectified.rgb, cv2.remap(rgb, *maps, cv2.INTER_LINEAR))
+    assert not np.array_equal(rectified.rgb, rgb)
+
+
+def test_maps_are_computed_once_a_camera(make_bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    compute = cv2.initUndistortRectifyMap
+    monkeypatch.setattr(cv2, 'initUndistortRectifyMap', lambda *a: calls.append(a) or compute(*a))
+    bench = make_bench()
+    bent, more = ({'distortion_model': 'plumb_bob', 'd': [k1, 0.0, 0.0, 0.0, 0.0]} for k1 in (-0.2, -0.3))
+    for number in range(3):
+        assert bench.feed(SECOND * (1 + number), info=info(**bent))
+    assert len(calls) == 1
+    assert bench.feed(SECOND * 10, info=info(**more)) and len(calls) == 2
+
+
+def test_camera_info_of_zeros_changes_nothing(make_bench: Callable[..., Bench]) -> None:
+    bench = make_bench()
+    assert bench.feed(SECOND, info=info(k=[0.0] * 9)) == []  # waits for one that makes sense
+    first, second = bench.feed(2 * SECOND)
+    assert (first.stamp_ns, second.stamp_ns) == (SECOND, 2 * SECOND)
+    (frame,) = bench.feed(3 * SECOND, info=info(k=[0.0] * 9))
+    assert frame.camera == first.camera
+    assert 'CameraInfo left out' in bench.said() and 'not calibrated' in bench.said()
+
+
+def test_depth_of_half_the_resolution_is_taken_other_shapes_are_refused(make_bench: Callable[..., Bench]) -> None:
+    bench = make_bench()
+    (frame,) = bench.feed(SECOND, depth_m=DEPTH[::2, ::2])
+    assert frame.depth_m.shape == (48, 64) and (frame.depth_m == 2.0).all()
+    assert bench.feed(2 * SECOND, depth_m=DEPTH[:36]) == []
+    assert 'frame left out: depth image is 64x36' in bench.said() and 'aligned_depth_to_color' in bench.said()
+
+
+def test_colour_and_depth_that_are_far_apart_are_told_with_the_gap(make_bench: Callable[..., Bench]) -> None:
+    bench = make_bench(sync_max_interval=0.1)
+    bench.feed(SECOND, depth_delay_ns=19_000_000)
+    bench.feed(2 * SECOND, depth_delay_ns=0)
+    assert 'from its colour' not in bench.said()
+    bench.feed(3 * SECOND, depth_delay_ns=-45_000_000)
+    assert len(bench.intake.flush()) == 1
+    assert 'depth is -0.045 s from its colour' in bench.said()
+
+
+def test_images_of_different_frames_are_told(make_bench: Callable[..., Bench]) -> None:
+    bench = make_bench()
+    assert bench.feed(SECOND) and 'registered' not in bench.said()
+    assert bench.feed(2 * SECOND, depth_frame='') and 'registered' not in bench.said()
+    assert bench.feed(3 * SECOND, depth_frame='camera_depth_optical_frame')
+    assert "depth is in frame 'camera_depth_optical_frame', colour in 'camera_optical_frame'" in bench.said()
+
+
+def test_frames_that_the_gate_keeps_out_are_not_decoded(make_bench: Callable[..., Bench]) -> None:
+    bench = make_bench()
+    bench.gate.is_paused = True
+    broken = images.color_message(MAKE, RGB, SECOND, '')
+    broken.encoding = 'nv99'
+    bench.feed(SECOND)
+    bench.intake.color(broken)
+    assert bench.skipped == [SECOND] and 'left out' not in bench.said()
+
+
+def test_a_jump_back_begins_an_epoch(make_bench: Callable[..., Bench]) -> None:
+    bench = make_bench(time_jump_threshold=10.0)
+    epochs = [frame.epoch for second in (100, 101, 95, 50, 51) for frame in bench.feed(second * SECOND)]
+    assert epochs == [0, 0, 1, 1]  # 95 is late, 50 has jumped
+
+
+# --- over DDS ---
+
+
+def padded(pixels: np.ndarray) -> dict[str, Any]:
+    """Step and data of pixels whose rows are five bytes longer than they need be."""
+    rows = np.ascontiguousarray(pixels).reshape(len(pixels), -1).view(np.uint8)
+    rows = np.hstack([rows, np.full((len(rows), 5), 170, np.uint8)])
+    return {'step': rows.shape[1], 'data': rows.tobytes()}
+
+
+def uyvy(rgb: np.ndarray) -> np.ndarray:
+    """[H, W, 2]: each two pixels share the colour of the first."""
+    yuv = cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV).astype(np.float32)
+    luma = np.clip(yuv[..., 0] * 219 / 255 + 16, 16, 235)
+    chroma = 128 + (yuv[..., 1:] - 128) * (224 / 255)  # BT.601 with headroom
+    packed = np.empty((*luma.shape, 2), np.float32)
+    packed[..., 1] = luma
+    packed[:, 0::2, 0], packed[:, 1::2, 0] = chroma[:, 0::2, 0], chroma[:, 0::2, 1]
+    return np.rint(np.clip(packed, 0, 255)).astype(np.uint8)
+
+
+def bayer_rggb(rgb: np.ndarray) -> np.ndarray:
+    mosaic = rgb[..., 1].copy()
+    mosaic[0::2, 0::2], mosaic[1::2, 1::2] = rgb[0::2, 0::2, 0], rgb[1::2, 1::2, 2]
+    return mosaic
+
+
+COLOURS = {
+    'bgr8': lambda rgb: rgb[..., ::-1],
+    'rgba8': lambda rgb: np.dstack([rgb, np.full(rgb.shape[:2], 7, np.uint8)]),
+    'bgra8': lambda rgb: np.dstack([rgb[..., ::-1], np.full(rgb.shape[:2], 7, np.uint8)]),
+    'mono8': lambda rgb: cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY),
+    'bayer_rggb8': bayer_rggb,
+    'yuv422': uyvy,
+    'yuv422_yuy2': lambda rgb: uyvy(rgb)[..., ::-1],
+}
+DEPTHS = {
+    '16UC1': lambda depth_m: np.rint(depth_m * 1000).astype('<u2'),
+    'mono16': lambda depth_m: np.rint(depth_m * 1000).astype('<u2'),
+    '16UC1 big-endian': lambda depth_m: np.rint(depth_m * 1000).astype('>u2'),
+    '32FC1 big-endian': lambda depth_m: depth_m.astype('>f4'),
+}
+
+
+def test_every_encoding_reaches_slam_as_the_same_view(graph: Graph, frames: SyntheticSequence) -> None:
+    """Pixels in another order, scale or place would not agree with the map: the frame would be lost."""
+    live = Live(graph, queue_policy='all', slam__tracking__min_inlier_fraction=0.7, slam__tracking__iterations=20)
+    assert live.show(still(frames, 0))
+    for number, (encoding, encode) in enumerate({**COLOURS, **DEPTHS}.items(), start=1):
+        frame = still(frames, number)
+        name = 'rgb' if encoding in COLOURS else 'depth'
+        pixels = encode(frame.rgb if name == 'rgb' else frame.depth_m)
+        fields = {'encoding': encoding.split()[0], 'is_bigendian': int('big' in encoding), **padded(pixels)}
+        pose = live.show(frame, **{f'{name}__{field}': value for field, value in fields.items()})
+        assert pose is not None, f'{encoding}: {live.node.text}'
+        assert np.linalg.norm(position(pose)) < STILL_M, encoding
+
+
+def test_a_camera_that_changes_starts_a_new_map(graph: Graph, frames: SyntheticSequence) -> None:
+    live = Live(graph, save_path=graph.folder / 'run', queue_policy='all')
+    assert live.show(still(frames, 0))
+    other = still(frames, 1).camera
+    pose = live.show(still(frames, 1), info__k=[other.fx * 1.1, 0.0, other.cx, 0.0, other.fy, other.cy, 0.0, 0.0, 1.0])
+    assert pose is not None and not position(pose).any()
+    assert live.node.says('map reset: the camera changed', 'previous')

@@ -1,0 +1,85 @@
+"""Velocity and covariance in closed form, and the path's bound."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splatam_core import se3
+from splatam_core.types import FrameResult, StageTimings, Status
+from splatam_ros.frames import Located
+from splatam_ros.odometry import UNKNOWN_VARIANCE, MotionEstimator
+from splatam_ros.outputs import PathHistory
+
+POSITION_M, ORIENTATION_RAD = 0.02, 0.01
+T_BODY_CAMERA = se3.exp(np.array([0.3, 0, 0.5, 0, 0.4, 0]))
+TWIST = np.array([0.5, 0, 0.1, 0, 0.2, -0.3])
+EXACT = 1e-9  # differences of poses over a tenth of a second, in float64
+
+
+def observe(estimator, tenths, T_map_body, sure=1.0, inliers=1.0):
+    stamp_ns = 10**9 + tenths * 10**8
+    located = Located(stamp_ns, 'camera', 'body', np.eye(4), T_map_body @ T_BODY_CAMERA, T_map_body, None)
+    result = FrameResult(tenths, stamp_ns, Status.TRACKED, np.eye(4), False, 1, sure, inliers, '', StageTimings())
+    return estimator.observe(located, result)
+
+
+@pytest.fixture
+def estimator() -> MotionEstimator:
+    return MotionEstimator(POSITION_M, ORIENTATION_RAD)
+
+
+def test_a_constant_twist_is_found_in_the_bodys_axes(estimator: MotionEstimator) -> None:
+    T_start = se3.exp(np.array([1, 2, 3, 0.5, 0.1, 1.2]))
+    motions = [observe(estimator, n, T_start @ se3.exp(TWIST * n / 10)) for n in (0, 1, 3)]  # stamps count, not frames
+    assert (motions[0].twist == 0).all() and (np.diag(motions[0].twist_covariance) == UNKNOWN_VARIANCE).all()
+    for motion in motions[1:]:
+        np.testing.assert_allclose(motion.twist, TWIST, atol=EXACT)
+
+
+def test_over_a_gap_in_which_the_camera_was_lost_there_is_no_velocity(estimator: MotionEstimator) -> None:
+    observe(estimator, 0, np.eye(4))
+    estimator.lost()
+    motion = observe(estimator, 9, se3.exp(TWIST))
+    assert (motion.twist == 0).all() and (np.diag(motion.twist_covariance) == UNKNOWN_VARIANCE).all()
+
+
+def test_a_pose_that_fewer_pixels_support_is_less_sure(estimator: MotionEstimator) -> None:
+    whole = observe(estimator, 0, np.eye(4)).pose_covariance
+    quarter = observe(estimator, 1, np.eye(4), sure=0.5, inliers=0.5).pose_covariance
+    np.testing.assert_allclose(quarter, 4 * whole, rtol=1e-12)
+    np.testing.assert_allclose(np.sqrt(np.diag(whole)[3:]), ORIENTATION_RAD, rtol=1e-12)
+
+
+def test_covariances_are_what_perturbed_poses_show(estimator: MotionEstimator) -> None:
+    """Monte Carlo: the camera's pose is perturbed as the parameters say; the body's scatters as stated."""
+    rng = np.random.default_rng(0)
+    T_before, T_now = (se3.exp(np.array([1, 2, 3, 0.5, 0.1, 1.2])) @ se3.exp(TWIST * s) for s in (0.0, 0.1))
+    observe(estimator, 0, T_before)
+    stated = observe(estimator, 1, T_now)
+
+    def perturbed(T_map_body: np.ndarray) -> np.ndarray:
+        T = T_map_body @ T_BODY_CAMERA
+        turned = se3.exp(np.concatenate([np.zeros(3), rng.normal(0, ORIENTATION_RAD, 3)]))
+        T = np.block([[turned[:3, :3] @ T[:3, :3], T[:3, 3:] + rng.normal(0, POSITION_M, (3, 1))], [0, 0, 0, 1]])
+        return T @ se3.inverse(T_BODY_CAMERA)
+
+    poses, twists = [], []
+    for _ in range(4000):
+        before, now = perturbed(T_before), perturbed(T_now)
+        turn = se3.rotation_vector(now[:3, :3] @ T_now[:3, :3].T)
+        poses.append(np.concatenate([now[:3, 3] - T_now[:3, 3], turn]))
+        twists.append(se3.log(se3.inverse(before) @ now) / 0.1)
+    # A variance of 4000 samples scatters by 2 %; rotation over the interval is taken to be small: 0.04 rad.
+    for stated_covariance, samples in ((stated.pose_covariance, poses), (stated.twist_covariance, twists)):
+        scale = np.sqrt(np.outer(np.diag(stated_covariance), np.diag(stated_covariance)))
+        np.testing.assert_allclose(np.cov(np.array(samples).T) / scale, stated_covariance / scale, atol=0.12)
+
+
+def test_a_path_is_bounded_even_and_ends_with_the_newest() -> None:
+    history = PathHistory(10)
+    for number in range(1, 1001):
+        history.append(number)
+        assert len(history.poses) <= 10 and history.poses[-1] == number and history.poses[0] == 1
+    steps = np.diff(history.poses[:-1])
+    assert (steps == steps[0]).all()

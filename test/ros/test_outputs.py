@@ -1,0 +1,284 @@
+"""What leaves the node, over DDS: silence while lost, diagnostics, the map for whoever comes late, and the viewers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from camera import CAMERA_FRAME, LATCHED, Camera, run_node, still
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from graph import Graph
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import Header
+
+from msg_adapters import stamps
+from splatam_core.datasets.synthetic import SyntheticSequence
+from splatam_core.resources import config_dir
+from splatam_core.types import RgbdFrame, Status
+from splatam_ros import interface
+from splatam_ros.diagnostics import InputSample, Sample, reports
+from splatam_ros.outputs import OUTPUTS
+from splatam_ros.parameters import NODE_SETTINGS
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+def covered(frame: RgbdFrame) -> RgbdFrame:
+    """What a camera sees through a hand: nothing at any distance it can measure."""
+    return replace(frame, depth_m=np.full_like(frame.depth_m, 0.05))
+
+
+class Diagnostics:
+    """The newest statuses by name."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.arrays = graph.collect(DiagnosticArray, '/diagnostics')
+
+    def __getitem__(self, name: str) -> DiagnosticStatus:
+        return next(status for status in self.arrays[-1].status if status.name == f'splatam: {name}')
+
+    def level(self, name: str) -> bytes | None:
+        return self[name].level if self.arrays else None
+
+    def values(self, name: str) -> dict[str, str]:
+        return {item.key: item.value for item in self[name].values}
+
+
+def test_a_covered_camera_is_lost_in_silence_and_found_again(
+    graph: Graph, tf_message: type, frames: SyntheticSequence
+) -> None:
+    camera, diagnostics = Camera(graph), Diagnostics(graph)
+    done = graph.collect(Header, '/splatam/processed')
+    heard = {
+        'pose': graph.collect(PoseStamped, '/splatam/pose'), 'odometry': graph.collect(Odometry, '/splatam/odometry'),
+        'path': graph.collect(PathMessage, '/splatam/path', LATCHED), 'tf': graph.collect(tf_message, '/tf'),
+        'map/points': graph.collect(PointCloud2, '/splatam/map/points', LATCHED),
+    }  # fmt: skip
+    node = run_node(graph, queue_policy='all', publish_rate__path=0.0, publish_rate__cloud=0.0)
+    camera.wait_matched()
+    graph.spin_until(lambda: diagnostics.level('tracking') == WARN, explain=lambda: node.text)
+    assert diagnostics['tracking'].message == 'no frame yet'
+
+    def send(frame: RgbdFrame) -> None:
+        camera.send(frame)
+        graph.spin_until(lambda: done and stamps.to_ns(done[-1].stamp) == frame.stamp_ns, explain=lambda: node.text)
+
+    for number in range(3):
+        send(still(frames, number))
+    graph.spin_until(lambda: diagnostics.level('tracking') == OK and heard['tf'] and heard['map/points'])
+    assert diagnostics.values('tracking')['status'] == 'tracked'
+    assert float(diagnostics.values('tracking')['share of it that agrees with the map']) > 0.5
+    gaussians = diagnostics.values('map')['Gaussians']
+    graph.spin_for(0.5)  # whoever was behind has been told
+    before = {name: len(messages) for name, messages in heard.items()}
+
+    for number in range(3, 6):
+        send(covered(still(frames, number)))
+    graph.spin_until(lambda: diagnostics.level('tracking') == ERROR, explain=lambda: node.text)
+    assert diagnostics['tracking'].message == 'lost: no pixel has a usable depth reading'
+    assert diagnostics.values('map')['Gaussians'] == gaussians
+    graph.spin_for(0.5)
+    assert {name: len(messages) for name, messages in heard.items()} == before
+
+    send(still(frames, 6))
+    graph.spin_until(lambda: diagnostics.level('tracking') == OK, explain=lambda: node.text)
+    found = heard['odometry'][-1]
+    assert stamps.message_stamp_ns(found) == still(frames, 6).stamp_ns
+    assert found.twist.covariance[0] == 1e6  # how it came here is not known
+    assert heard['odometry'][2].twist.covariance[0] < 1  # as it was before
+
+
+def test_diagnostics_say_what_comes_and_goes(graph: Graph, frames: SyntheticSequence) -> None:
+    camera, diagnostics = Camera(graph), Diagnostics(graph)
+    done = graph.collect(Header, '/splatam/processed')
+    node = run_node(graph, queue_policy='all')
+    camera.wait_matched()
+    sent = iter(range(10**6))
+    topics = '/rgb/image', '/depth/image', '/rgb/camera_info'
+
+    def busy() -> bool:
+        """At 5 Hz, with the camera's clock half a second behind."""
+        stamp_ns = graph.node.get_clock().now().nanoseconds - 500_000_000
+        camera.send(replace(still(frames, next(sent)), stamp_ns=stamp_ns))
+        graph.spin_for(0.2)
+        if not done or diagnostics.level('processing') != OK or float(values('processing', 'pose rate (Hz)')) < 2:
+            return False
+        # What came while the node was busy with the first frame has been taken: 5 Hz, give or take a busy machine.
+        return all(1.5 < float(values('input', f'{topic} rate (Hz)')) < 10 for topic in topics)
+
+    def values(name: str, key: str) -> str:
+        return diagnostics.values(name)[key]
+
+    graph.spin_until(busy, explain=lambda: f'{diagnostics.arrays[-1:]} {node.text}')
+    array = diagnostics.arrays[-1]
+    assert [status.name for status in array.status] == [
+        'splatam: input', 'splatam: tracking', 'splatam: processing', 'splatam: map'
+    ]  # fmt: skip
+    assert {status.hardware_id for status in array.status} == {CAMERA_FRAME}
+    assert abs(stamps.message_stamp_ns(array) - graph.node.get_clock().now().nanoseconds) < 10e9
+    for topic in topics:
+        assert 0.5 <= float(values('input', f'{topic} delay (s)')) < 30  # more than 0.5: a backlog, on a busy machine
+        assert values('input', f'{topic} publishers') == '1'
+    assert float(values('processing', 'pose delay (s)')) > 0.5
+    assert 0 < float(values('processing', 'track (ms)')) < float(values('processing', 'total (ms)'))
+    assert {'frames waiting', 'frames dropped', 'frames refused', 'densify (ms)', 'map (ms)'} <= (
+        diagnostics.values('processing').keys()
+    )
+    assert int(values('map', 'Gaussians')) > 1000
+    assert 50 < float(values('map', 'memory (MB)')) < 4000  # torch alone is above the one
+
+
+def sample(seconds: float, *, received: int = 0, trouble: str = '', **changes: Any) -> Sample:
+    counters = {
+        'monotonic_s': seconds, 'inputs': [InputSample('/rgb/image', received, 1, 0.01)], 'unpaired': 0,
+        'waiting_frames': 0, 'dropped_frames': 0, 'refused_frames': 0, 'frames': dict.fromkeys(Status, 0), 'poses': 0,
+        'delay_s': None, 'result': None, 'rss_mb': None, 'trouble': trouble,
+    }  # fmt: skip
+    return Sample(**{**counters, **changes})
+
+
+@pytest.mark.parametrize(
+    ('changes', 'name', 'level', 'text'),
+    [
+        ({'trouble': 'no publisher on /rgb/image'}, 'input', ERROR, 'no frames: no publisher on /rgb/image'),
+        ({'unpaired': 3}, 'input', WARN, '3 images dropped without a partner'),
+        ({}, 'input', OK, 'waiting for the first frame'),
+        ({'dropped_frames': 2}, 'processing', WARN, 'slower than the camera: 2 frames dropped'),
+        ({'refused_frames': 1, 'dropped_frames': 2}, 'processing', WARN, '1 frames could not be used'),
+        ({}, 'map', OK, '0 Gaussians'),
+    ],
+)
+def test_levels(changes: dict[str, Any], name: str, level: bytes, text: str) -> None:
+    found = {report.name: report for report in reports(sample(0), sample(2, **changes))}
+    assert (found[name].level, found[name].text) == (level, text)
+
+
+def test_rates_are_of_the_time_between_two_samples() -> None:
+    frames = {**dict.fromkeys(Status, 0), Status.TRACKED: 7}
+    found = reports(sample(10, received=100), sample(12, received=160, frames=frames, poses=6))
+    values = {key: value for report in found for key, value in report.values.items()}
+    assert values['/rgb/image rate (Hz)'] == '30.0'
+    assert (values['frame rate (Hz)'], values['pose rate (Hz)']) == ('3.5', '3.0')
+
+
+def test_the_map_is_there_for_whoever_comes_after_the_last_frame(graph: Graph, frames: SyntheticSequence) -> None:
+    camera, done = Camera(graph), graph.collect(Header, '/splatam/processed')
+    node = run_node(graph, queue_policy='all', max_cloud_points=100, max_path_poses=2)
+    camera.wait_matched()
+    for number in range(4):
+        camera.send(still(frames, number))
+    graph.spin_until(lambda: len(done) == 4, explain=lambda: node.text)
+    clouds = graph.collect(PointCloud2, '/splatam/map/points', LATCHED)
+    paths = graph.collect(PathMessage, '/splatam/path', LATCHED)
+    graph.spin_until(lambda: clouds and paths, explain=lambda: node.text)
+
+    (cloud,), (path,) = clouds, paths
+    assert stamps.message_stamp_ns(cloud) == stamps.message_stamp_ns(path) == still(frames, 3).stamp_ns
+    assert [stamps.message_stamp_ns(pose) for pose in path.poses] == [still(frames, n).stamp_ns for n in (0, 3)]
+    check_cloud(cloud, 100)
+    graph.spin_for(2.5)  # more than two periods of both
+    assert len(clouds) == len(paths) == 1  # nothing new, nothing said
+
+
+def check_cloud(cloud: PointCloud2, count: int) -> None:
+    """The layout that RViz's RGB8 transformer and Foxglove's ``rgb`` colour mode read, and ours behind it."""
+    assert [(field.name, field.offset, field.datatype, field.count) for field in cloud.fields] == [
+        (name, 4 * i, PointField.FLOAT32, 1) for i, name in enumerate(('x', 'y', 'z', 'rgb', 'opacity', 'radius'))
+    ]
+    assert (cloud.height, cloud.width, cloud.point_step, cloud.row_step) == (1, count, 24, 24 * count)
+    assert cloud.header.frame_id == 'map' and cloud.is_dense and not cloud.is_bigendian
+    opacity, radius = np.frombuffer(bytes(cloud.data), '<f4').reshape(count, 6)[:, 4:].T
+    assert ((opacity > 0) & (opacity < 1)).all()
+    assert ((radius > 1e-4) & (radius < 0.5)).all()  # metres; Gaussians of a room seen by 64x48 pixels
+
+
+# --- viewers: neither can run in a test, but what they need can be checked ---
+
+SHOWS = {
+    'rviz_default_plugins/PointCloud2': 'sensor_msgs/msg/PointCloud2',
+    'rviz_default_plugins/Path': 'nav_msgs/msg/Path',
+    'rviz_default_plugins/Pose': 'geometry_msgs/msg/PoseStamped',
+    'rviz_default_plugins/Odometry': 'nav_msgs/msg/Odometry',
+    'rviz_default_plugins/Image': 'sensor_msgs/msg/Image',
+}
+TOPICS = {f'/splatam/{output.topic}': output for output in OUTPUTS}
+MAP_FRAME = next(setting.default for setting in NODE_SETTINGS if setting.name == 'map_frame')
+
+
+def test_rviz_subscribes_to_what_the_node_publishes() -> None:
+    manager = yaml.safe_load((config_dir() / 'rviz' / 'splatam.rviz').read_text())['Visualization Manager']
+    displays = [display for display in manager['Displays'] if 'Topic' in display]
+    assert {display['Class'] for display in displays} == SHOWS.keys()
+    assert manager['Global Options']['Fixed Frame'] == MAP_FRAME
+    for display in displays:
+        topic = display['Topic']
+        output = TOPICS[topic['Value']]
+        assert output.type_name == SHOWS[display['Class']]
+        latched = output.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        assert topic['Durability Policy'] == ('Transient Local' if latched else 'Volatile')
+        assert topic['Reliability Policy'] == 'Reliable' and output.qos.reliability == ReliabilityPolicy.RELIABLE
+    (cloud,) = (display for display in displays if display['Class'].endswith('PointCloud2'))
+    assert (cloud['Color Transformer'], cloud['Position Transformer']) == ('RGB8', 'XYZ')
+
+
+def test_foxglove_shows_what_the_node_publishes() -> None:
+    layout = json.loads((config_dir() / 'foxglove' / 'splatam.json').read_text())
+    panels = layout['configById']
+    assert set(leaves(layout['layout'])) == panels.keys()
+    scene = panels['3D!map']
+    named = {*scene['topics'], *(panel['imageMode']['imageTopic'] for panel in panels.values() if 'imageMode' in panel)}
+    assert named <= TOPICS.keys() and scene['followTf'] == MAP_FRAME
+    cloud = scene['topics']['/splatam/map/points']
+    # Foxglove's own choice for a little-endian field called rgb.
+    assert (cloud['colorMode'], cloud['colorField'], cloud['rgbByteOrder']) == ('rgb', 'rgb', 'abgr')
+    for path in panels['Plot!speed']['paths']:
+        topic, *fields = path['value'].split('.')
+        value: Any = {'nav_msgs/msg/Odometry': Odometry}[TOPICS[topic].type_name]()
+        for field in fields:
+            value = getattr(value, field)
+        assert isinstance(value, float)
+
+
+def leaves(node: Any) -> list[str]:
+    return [node] if isinstance(node, str) else [*leaves(node['first']), *leaves(node['second'])]
+
+
+# --- the documentation's tables ---
+
+
+def test_the_documented_topics_are_those_of_a_running_node(graph: Graph, tf_message: type) -> None:
+    node = run_node(graph, odom__source='tf')
+    node.wait_says('waiting for')
+    relative = {topic.name: topic.type_name for topic in interface.INPUTS if 'instead' not in topic.help}
+    expected_in = {resolved(name): type_name for name, type_name in relative.items() if name != 'odom'}
+    expected_out = {f'/splatam/{output.topic}': output.type_name for output in OUTPUTS}
+    expected_out |= {resolved(topic.name): topic.type_name for topic in interface.OUTPUTS}
+    subscribed = on_graph(lambda: graph.node.get_subscriber_names_and_types_by_node('splatam', '/'))
+    published = on_graph(lambda: graph.node.get_publisher_names_and_types_by_node('splatam', '/'))
+    own = {'/rosout', '/parameter_events'}  # rclpy's
+    graph.spin_until(lambda: subscribed().keys() - own == expected_in.keys(), explain=lambda: str(subscribed()))
+    graph.spin_until(lambda: published().keys() - own == expected_out.keys(), explain=lambda: str(published()))
+    assert subscribed().items() >= expected_in.items() and published().items() >= expected_out.items()
+
+
+def resolved(name: str) -> str:
+    return name.replace('~', '/splatam') if name.startswith('~') else name if name.startswith('/') else f'/{name}'
+
+
+def on_graph(ask: Callable[[], list[tuple[str, list[str]]]]) -> Callable[[], dict[str, str]]:
+    def answer() -> dict[str, str]:
+        try:
+            return {name: types[0] for name, types in ask()}
+        except RuntimeError:  # rclpy: the node has not been discovered yet
+            return {}
+
+    return answer

@@ -1,0 +1,143 @@
+"""Writes the tables of docs/ros.md from the code, or with ``--check`` says whether they are stale.
+
+Run as ``python tools/ros_reference.py``. Everything between ``<!-- generated: NAME -->`` and ``<!-- end -->`` is
+replaced by what ``SECTIONS[NAME]`` returns; the text around it is written by hand. A new kind of table (services, say)
+is a function that returns Markdown, a line in ``SECTIONS``, and the two markers in docs/ros.md.
+``test/ros/test_reference.py`` fails when the file is stale, and holds the tables against a running node.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from splatam_core.config import Setting
+from splatam_ros import interface
+from splatam_ros.cameras import CAMERAS
+from splatam_ros.outputs import OUTPUTS
+from splatam_ros.parameters import NODE_SETTINGS, why_fixed
+from splatam_ros.services import SERVICES
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / 'docs' / 'ros.md'
+FEATURES = ROOT / 'test' / 'ros' / 'features.yaml'
+SECTION = re.compile(r'(<!-- generated: (\w+) -->\n).*?(<!-- end -->)', re.DOTALL)
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [head, ['---'] * len(head), *rows]
+    return ''.join(f'| {" | ".join(cell.replace("|", chr(92) + "|") for cell in line)} |\n' for line in lines)
+
+
+def inputs() -> str:
+    """What the node subscribes to."""
+    return table(
+        ('topic', 'type', ''), ((f'`{topic.name}`', topic.type_name, topic.help) for topic in interface.INPUTS)
+    )
+
+
+def outputs() -> str:
+    """What the node publishes."""
+    own = [(f'`~/{output.topic}`', output.type_name, output.trigger.value, output.help) for output in OUTPUTS]
+    shared = [(f'`{topic.name}`', topic.type_name, topic.when, topic.help) for topic in interface.OUTPUTS]
+    return table(('topic', 'type', 'when', ''), [*own, *shared])
+
+
+def parameters() -> str:
+    """The node's own parameters."""
+    return table(('parameter', 'default', 'allowed', 'at run time', ''), map(_parameter, NODE_SETTINGS))
+
+
+def _parameter(setting: Setting) -> Sequence[str]:
+    default = str(setting.default).lower() if isinstance(setting.default, bool) else str(setting.default)
+    changes = '' if why_fixed(setting.name) else 'yes'
+    return f'`{setting.name}`', f'`{default}`' if default else 'empty', _allowed(setting), changes, setting.help
+
+
+def _allowed(setting: Setting) -> str:
+    if setting.choices:
+        return ', '.join(setting.choices)
+    pairs = ('≥', setting.minimum), ('≤', setting.maximum)
+    bounds = [f'{sign} {bound:g}' for sign, bound in pairs if bound is not None]
+    return ' '.join([setting.type.__name__, ', '.join(bounds), setting.unit]).strip()
+
+
+def frames() -> str:
+    """The coordinate frames."""
+    return table(('frame', 'parameter', ''), ((f.default, f'`{f.parameter}`', f.help) for f in interface.FRAMES))
+
+
+def features() -> str:
+    """What users expect of an RGB-D SLAM node, and the tests that show it."""
+    return table(('feature', 'level', 'shown by'), map(_feature, yaml.safe_load(FEATURES.read_text())))
+
+
+def _feature(row: dict[str, Any]) -> Sequence[str]:
+    shown = [f'`{test}`' for test in row.get('tests', ())]
+    shown += [row['not_tested']] if 'not_tested' in row else []
+    return row['feature'], row['level'], '<br>'.join(shown)
+
+
+def services() -> str:
+    """What can be asked of the node."""
+    return table(('service', ''), ((f'`~/{service.name}`', service.help) for service in SERVICES))
+
+
+def cameras() -> str:
+    """Cameras whose topics are known."""
+    return table(
+        ('`camera:=`', '', 'driver', 'colour, depth, camera info', ''),
+        (
+            (name, f'[{c.title}]({c.source})', f'`{c.driver}`', f'`{c.rgb}` `{c.depth}` `{c.info}`', c.facts)
+            for name, c in CAMERAS.items()
+        ),
+    )
+
+
+SECTIONS: dict[str, Callable[[], str]] = {
+    'inputs': inputs,
+    'outputs': outputs,
+    'frames': frames,
+    'parameters': parameters,
+    'services': services,
+    'cameras': cameras,
+    'features': features,
+}
+
+
+def generate(text: str) -> str:
+    """The page with its tables made anew.
+
+    Raises:
+        ValueError: a section is unknown, or one is missing.
+    """
+    names = [match[2] for match in SECTION.finditer(text)]
+    if sorted(names) != sorted(SECTIONS):
+        raise ValueError(f'{PAGE.name} has the sections {names}; expected each of {list(SECTIONS)} once')
+    return SECTION.sub(lambda match: f'{match[1]}{SECTIONS[match[2]]()}{match[3]}', text)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write the page, or check it; returns the exit code."""
+    parser = argparse.ArgumentParser(description='Write the tables of docs/ros.md from the code.')
+    parser.add_argument('--check', action='store_true', help='change nothing; exit code 1 if the tables are stale')
+    check = parser.parse_args(arguments).check
+    before = PAGE.read_text()
+    after = generate(before)
+    if check:
+        if before != after:
+            print(f'{PAGE.relative_to(ROOT)} is stale: run python tools/ros_reference.py', file=sys.stderr)
+        return int(before != after)
+    PAGE.write_text(after)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
