@@ -6,18 +6,19 @@ SHELL := /bin/bash
 
 VENV := .venv
 BIN := $(VENV)/bin
-CSRC := $(wildcard splatam_core/rasterizer/csrc/*)
+CSRC := $(wildcard splatam_core/csrc/*)
 FINDABLE = $(foreach name,python3 python3.12 python3.11 python3.10,$(shell $(name) -c '$(CHECK_PYTHON)' 2>/dev/null && echo $(name)))
 CHECK_PYTHON := import sys; sys.exit(0 if (3, 10) <= sys.version_info < (3, 13) else 1)
 PYTHON ?= $(firstword $(FINDABLE))
 export SPLATAM_DATA ?= $(abspath ../shared/data)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup test demo colcon check-aarch64 clean
+.PHONY: help setup test tf2_msgs demo colcon check-aarch64 clean
 
 help:
 	@echo 'make setup           make $(VENV) with everything in it (PYTHON=python3.11 chooses the interpreter)'
 	echo 'make test            run the whole test suite'
+	echo 'make tf2_msgs        build the messages of /tf into $(VENV), for a ROS from pip, which lacks them'
 	echo 'make demo [BAG=path] play a recording into the node and score what comes out, in out/demo'
 	echo 'make colcon          build and test as a ROS package, in a scratch workspace'
 	echo 'make check-aarch64   compile the kernels for the processors of robots'
@@ -43,7 +44,14 @@ $(VENV)/.installed: setup.py package.xml pyproject.toml constraints.txt | $(VENV
 	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[ros,test]'
 	touch $@
 
-test: setup
+# TF for a ROS that comes from pip, which has no tf2_msgs; where ROS is installed it is there already.
+tf2_msgs: $(VENV)/.tf2_msgs
+$(VENV)/.tf2_msgs: tools/tf2_msgs.py | $(VENV)/.installed
+	@echo 'generating tf2_msgs into $(VENV)'
+	$(BIN)/python -c 'import tf2_msgs.msg' 2>/dev/null || $(BIN)/python tools/tf2_msgs.py $(VENV)
+	touch $@
+
+test: setup tf2_msgs
 	@$(BIN)/python -m pytest -q
 
 demo: setup
@@ -82,5 +90,5 @@ check-aarch64: $(VENV)/.native
 
 clean:
 	@rm -rf build dist install log *.egg-info .pytest_cache .hypothesis .ruff_cache
-	rm -f splatam_core/rasterizer/_native*.so $(VENV)/.native
+	rm -f splatam_core/_native*.so $(VENV)/.native
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +

@@ -1,0 +1,99 @@
+"""A camera for benchmarks: publishes the images of a bag at a fixed rate, whether anybody keeps up or not.
+
+    python benchmarks/camera.py BAG LOG [--rate 30] [--frames N] [--now]
+
+BAG is one of ``splatam convert``'s; all of it is in memory before the first frame. Waits for subscribers of all topics.
+LOG gets a line a frame: its stamp, and when the later of its two images was handed to ROS (wall clock), in nanoseconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import struct
+import sys
+import time
+from collections.abc import Iterator
+from itertools import cycle, islice
+from pathlib import Path
+
+import rclpy
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from splatam_core.datasets.rosbag import DEPTH_TOPIC, INFO_TOPIC, RGB_TOPIC
+from splatam_ros.process import StopRequest, ros
+from splatam_ros.recording import Recording, stamp_of
+
+TOPICS = (INFO_TOPIC, RGB_TOPIC, DEPTH_TOPIC)
+AS_DRIVERS_DO = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+DISCOVERY_S = 60.0
+Frame = dict[str, bytes]
+
+
+def frames_of(recording: Recording) -> list[Frame]:
+    """The serialized messages of each stamp that has all three."""
+    by_stamp: dict[int, Frame] = {}
+    for message in recording.messages(TOPICS):
+        by_stamp.setdefault(stamp_of(message.data), {})[message.topic] = message.data
+    return [frame for frame in by_stamp.values() if len(frame) == len(TOPICS)]
+
+
+def stamped(data: bytes, stamp_ns: int) -> bytes:
+    """A serialized message with another stamp; little endian, as bags are written."""
+    return data[:4] + struct.pack('<iI', *divmod(stamp_ns, 10**9)) + data[12:]
+
+
+def due_times(rate_hz: float) -> Iterator[float]:
+    """Monotonic seconds at which frames are due; what was missed is not caught up."""
+    due_s = time.monotonic()
+    while True:
+        yield due_s
+        due_s = max(due_s + 1 / rate_hz, time.monotonic())
+
+
+def publish(
+    publishers: dict[str, Publisher], frames: list[Frame], args: argparse.Namespace, stop: StopRequest
+) -> Iterator[str]:
+    """Publish; yields the lines of the log."""
+    count = args.frames or len(frames)
+    for frame, due_s in zip(islice(cycle(frames), count), due_times(args.rate)):
+        while not stop.requested and (left_s := due_s - time.monotonic()) > 0:
+            time.sleep(left_s)
+        if stop.requested:
+            return
+        stamp_ns = time.time_ns() if args.now else stamp_of(frame[RGB_TOPIC])
+        for topic in TOPICS:
+            data = stamped(frame[topic], stamp_ns) if args.now else frame[topic]
+            handed_over_ns = time.time_ns()
+            publishers[topic].publish(data)
+        yield f'{stamp_ns} {handed_over_ns}\n'
+
+
+def main() -> None:
+    """Publish until done or stopped."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('bag', type=Path)
+    parser.add_argument('log', type=Path)
+    parser.add_argument('--rate', type=float, default=30.0)
+    parser.add_argument('--frames', type=int, help='loop until so many are out (default: once through the bag)')
+    parser.add_argument('--now', action='store_true', help='stamp with the time of publishing')
+    args = parser.parse_args()
+    with Recording(args.bag) as recording, StopRequest() as stop, ros(()):
+        frames = frames_of(recording)
+        node = rclpy.create_node('camera')
+        publishers = {
+            topic: node.create_publisher(recording.topics[topic].message_class, topic, AS_DRIVERS_DO)
+            for topic in TOPICS
+        }
+        deadline_s = time.monotonic() + DISCOVERY_S
+        while not (stop.requested or all(item.get_subscription_count() for item in publishers.values())):
+            if time.monotonic() > deadline_s:
+                sys.exit(f'camera: nobody subscribes to {", ".join(TOPICS)}')
+            time.sleep(0.05)
+        with args.log.open('w') as log:
+            log.writelines(publish(publishers, frames, args, stop))
+        time.sleep(1.0)  # for what was published last to be taken
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,184 @@
+"""What the benchmarks of the running node share: its processes, what they cost, and the poses that come out."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from splatam_ros.demo import graph_environment
+from splatam_ros.process import ros
+from splatam_ros.recording import stamp_of
+
+HERE = Path(__file__).parent
+STOP_TIMEOUT_S = 60.0
+RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+
+
+class Child:
+    """A process that is measured. Its log is there to be read when something goes wrong."""
+
+    def __init__(self, command: list[str], log: Path) -> None:
+        self.log = log
+        with log.open('wb') as output:
+            self._process = subprocess.Popen(
+                [sys.executable, *command], stdin=subprocess.DEVNULL, stdout=output, stderr=output,
+                start_new_session=True,
+            )  # fmt: skip
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it has not ended."""
+        return self._process.poll() is None
+
+    def require(self, exit_code: int) -> None:
+        """Wait for the end.
+
+        Raises:
+            SystemExit: it ended otherwise.
+        """
+        if (code := self._process.wait(STOP_TIMEOUT_S)) != exit_code:
+            sys.exit(f'{self._process.args[1:]} ended with exit code {code}; it said:\n{self.log.read_text()}')
+
+    def stop(self) -> None:
+        """SIGINT, and wait."""
+        if self.is_running:
+            self._process.send_signal(signal.SIGINT)
+            try:
+                self._process.wait(STOP_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+
+    def cpu_s(self) -> float:
+        """Processor time so far, of all its threads."""
+        fields = Path(f'/proc/{self._process.pid}/stat').read_text().rpartition(')')[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+    def rss_mb(self) -> float:
+        """Memory it holds now, MiB."""
+        pages = int(Path(f'/proc/{self._process.pid}/statm').read_text().split()[1])
+        return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """A message with a header, as it came.
+
+    Attributes:
+        stamp_ns: its header's.
+        published_ns: when its publisher handed it over, wall clock.
+        received_ns: when this process took it, wall clock.
+    """
+
+    stamp_ns: int
+    published_ns: int
+    received_ns: int
+
+
+class Graph:
+    """A ROS graph of this benchmark's own: child processes, and a node that listens."""
+
+    def __init__(self, node: Node, folder: Path) -> None:
+        self.node = node
+        self._folder = folder
+        self._children: list[Child] = []
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(node)
+
+    def start(self, *command: str) -> Child:
+        """Start ``python command``."""
+        child = Child(list(command), self._folder / f'{len(self._children)}.log')
+        self._children.append(child)
+        return child
+
+    def start_node(self, preset: str, **parameters: object) -> Child:
+        """Start the SLAM node; ``a__b`` stands for the parameter ``a.b``."""
+        values = {'preset': preset, **{name.replace('__', '.'): value for name, value in parameters.items()}}
+        words = [word for name, value in values.items() for word in ('-p', f'{name}:={value}')]
+        return self.start('-m', 'splatam_ros.main', '--ros-args', *words)
+
+    def start_player(self, bag: Path, *options: str) -> Child:
+        """Start the player."""
+        return self.start('-m', 'splatam_ros.bag_player', str(bag), *options)
+
+    def start_camera(self, bag: Path, log: Path, *options: str) -> Child:
+        """Start the camera of ``camera.py``."""
+        return self.start(str(HERE / 'camera.py'), str(bag), str(log), *options)
+
+    def listen(self, topic: str, message_class: type = PoseStamped) -> list[Arrival]:
+        """Subscribe; the list grows while the graph spins."""
+        arrivals: list[Arrival] = []
+
+        def receive(data: bytes, info: dict[str, int]) -> None:
+            arrivals.append(Arrival(stamp_of(data), info['source_timestamp'], time.time_ns()))
+
+        self.node.create_subscription(message_class, topic, receive, RELIABLE, raw=True)
+        return arrivals
+
+    def spin_until(self, condition: Callable[[], object], timeout_s: float) -> bool:
+        """Take messages until a condition is met. Whether it was in time."""
+        deadline_s = time.monotonic() + timeout_s
+        while not condition():
+            if time.monotonic() > deadline_s:
+                return False
+            self._executor.spin_once(timeout_sec=0.05)
+        return True
+
+    def spin_for(self, seconds: float) -> None:
+        """Take messages for some time."""
+        self.spin_until(lambda: False, seconds)
+
+    def cpu_percent(self, child: Child, seconds: float) -> float:
+        """Take messages for some time, and see what a process needs meanwhile, percent of one core."""
+        cpu_s, wall_s = child.cpu_s(), time.monotonic()
+        self.spin_for(seconds)
+        return 100 * (child.cpu_s() - cpu_s) / (time.monotonic() - wall_s)
+
+    def close(self) -> None:
+        """End every process."""
+        for child in reversed(self._children):
+            child.stop()
+        self._executor.shutdown()
+        self.node.destroy_node()
+
+
+@contextmanager
+def graph(folder: Path) -> Iterator[Graph]:
+    """A graph that meets no other; its processes are gone afterwards.
+
+    Args:
+        folder: for logs.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    os.environ.update(graph_environment(os.environ, os.getpid()))
+    with ros(()):
+        opened = Graph(rclpy.create_node('benchmark'), folder)
+        try:
+            yield opened
+        finally:
+            opened.close()
+
+
+def convert(source: str, bag: Path, width: int, max_frames: int | None = None) -> None:
+    """Turn any source into a bag with the node's topic names."""
+    cut = ['--max-frames', str(max_frames)] if max_frames else []
+    command = ['-m', 'splatam_core.cli', 'convert', source, str(bag), '--width', str(width), *cut]
+    subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)
+
+
+def milliseconds(values_ns: list[int]) -> list[float]:
+    """Nanoseconds as milliseconds."""
+    return [value / 1e6 for value in values_ns]

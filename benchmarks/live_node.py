@@ -1,0 +1,124 @@
+"""The node beside a live camera: how old poses are, how many frames it has no time for, what it costs.
+
+    python benchmarks/live_node.py SOURCE [--preset quick] [--width 320] [--rate 30] [--max-frames N] [--runs 1]
+
+The recording is published as a camera would, at a fixed rate and whether anybody keeps up or not; ``queue_policy`` is
+``latest``. Latency runs from handing the later of a frame's two images to ROS until the pose has been received. What is
+published before the first pose is not counted: starting a map takes longer than a frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from header import print_header
+from live import Arrival, convert, graph, milliseconds
+from std_msgs.msg import Header
+
+START_TIMEOUT_S = 60.0
+MEASURING_S = 1.0  # at a time; the load is averaged over as many as fit
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One recording through the node.
+
+    Attributes:
+        latency_ms: of each pose.
+        published: frames counted.
+        processed: of those, tracked or lost.
+        tracked: of those, with a pose.
+        cpu_percent: of one core, the node's average.
+        rss_mb: the node's at the end.
+    """
+
+    latency_ms: list[float]
+    published: int
+    processed: int
+    tracked: int
+    cpu_percent: float
+    rss_mb: float
+
+
+def count(published_ns: dict[int, int], poses: list[Arrival], done: list[Arrival]) -> tuple[list[float], int, int, int]:
+    """Latencies, and frames published, processed and tracked after the first pose."""
+    first_ns = poses[0].received_ns
+    counted = {stamp_ns: at_ns for stamp_ns, at_ns in published_ns.items() if at_ns > first_ns}
+    answered = [pose for pose in poses if pose.stamp_ns in counted]
+    latency_ms = milliseconds([pose.received_ns - counted[pose.stamp_ns] for pose in answered])
+    return latency_ms, len(counted), sum(item.stamp_ns in counted for item in done), len(answered)
+
+
+def run_once(bag: Path, preset: str, rate_hz: float, folder: Path, parameters: dict[str, str]) -> Run:
+    """Publish a recording once.
+
+    Raises:
+        SystemExit: no pose came.
+    """
+    with graph(folder) as opened:
+        poses = opened.listen('/splatam/pose')
+        done = opened.listen('/splatam/processed', Header)
+        node = opened.start_node(preset, **parameters)
+        camera = opened.start_camera(bag, folder / 'frames', '--rate', str(rate_hz))
+        if not opened.spin_until(lambda: poses or not camera.is_running, START_TIMEOUT_S) or not poses:
+            sys.exit(f'no pose came; the node said:\n{node.log.read_text()}')
+        loads = []
+        while camera.is_running:
+            loads.append(opened.cpu_percent(node, MEASURING_S))
+        camera.require(0)
+        rss_mb = node.rss_mb()
+        lines = (line.split() for line in (folder / 'frames').read_text().splitlines())
+        counts = count({int(stamp_ns): int(at_ns) for stamp_ns, at_ns in lines}, poses, done)
+        return Run(*counts, statistics.mean(loads[:-1] or loads), rss_mb)  # the last is partly after the last frame
+
+
+def row(number: int, run: Run) -> str:
+    """A line of the table."""
+    if not run.published:
+        sys.exit('the recording was over before the first pose came: choose a longer one')
+    median, p95 = (
+        (statistics.median(run.latency_ms), float(np.percentile(run.latency_ms, 95)))
+        if run.latency_ms
+        else 2 * (np.nan,)
+    )
+    dropped = 100 * (1 - run.processed / run.published)
+    return (
+        f'| {number} | {median:.0f} | {p95:.0f} | {run.published} | {dropped:.1f} | {run.processed - run.tracked} '
+        f'| {run.cpu_percent:.0f} | {run.rss_mb:.0f} |'
+    )
+
+
+def main() -> None:
+    """Run and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('source', help="a recording, or 'synthetic'")
+    parser.add_argument('--preset', default='quick')
+    parser.add_argument('--width', type=int, default=320)
+    parser.add_argument('--rate', type=float, default=30.0)
+    parser.add_argument('--max-frames', type=int)
+    parser.add_argument('--runs', type=int, default=1)
+    parser.add_argument('-p', dest='parameters', action='append', default=[], metavar='NAME:=VALUE',
+                        help='a parameter of the node, as after --ros-args')  # fmt: skip
+    args = parser.parse_args()
+    parameters = dict(entry.split(':=', 1) for entry in args.parameters)
+    with tempfile.TemporaryDirectory() as scratch:
+        convert(args.source, bag := Path(scratch) / 'bag', args.width, args.max_frames)
+        runs = [
+            run_once(bag, args.preset, args.rate, Path(scratch) / str(i), parameters) for i in range(args.runs)
+        ]  # fmt: skip
+    name = Path(args.source).name
+    print_header(f'{name} live at {args.rate:g} Hz, preset `{args.preset}`, {args.width} pixels wide', args.runs)
+    print('| run | latency ms, median | p95 | frames counted | dropped % | lost | CPU % of a core | RSS MB |')
+    print('|---|---|---|---|---|---|---|---|')
+    for number, run in enumerate(runs, 1):
+        print(row(number, run))
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,116 @@
+"""The node for a long time: a recording is played over and over, and its memory is watched.
+
+    python benchmarks/soak.py [SOURCE] [--minutes 30] [--preset quick] [--width 320] [--max-frames 150]
+
+The player loops, stamps included, at rate 1; the node drops what it has no time for, as beside a camera. Frames in are
+counted by their CameraInfo, frames out by ``~/processed``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from header import print_header
+from live import Child, Graph, convert, graph
+from sensor_msgs.msg import CameraInfo
+from std_msgs.msg import Header
+
+START_TIMEOUT_S = 60.0
+SETTLING = 0.25  # share of the time that memory may grow: caches, allocators, the first map
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """The state at some time.
+
+    Attributes:
+        minutes: since the first frame.
+        rss_mb: of the node.
+        player_mb: of the player.
+        frames_in: so far.
+        processed: tracked and lost, so far.
+        poses: so far.
+    """
+
+    minutes: float
+    rss_mb: float
+    player_mb: float
+    frames_in: int
+    processed: int
+    poses: int
+
+
+def watch(opened: Graph, node: Child, player: Child, minutes: float, period_s: float) -> list[Sample]:
+    """Sample while both run.
+
+    Raises:
+        SystemExit: one of them ended, or no frame came.
+    """
+    infos = opened.listen('/rgb/camera_info', CameraInfo)
+    done = opened.listen('/splatam/processed', Header)
+    poses = opened.listen('/splatam/pose')
+    if not opened.spin_until(lambda: done, START_TIMEOUT_S):
+        sys.exit(f'no frame came out; the node said:\n{node.log.read_text()}')
+    samples: list[Sample] = []
+    started_s = time.monotonic()
+    while (elapsed_s := time.monotonic() - started_s) < 60 * minutes:
+        for child in (node, player):
+            if not child.is_running:
+                sys.exit(f'ended after {elapsed_s / 60:.1f} minutes; it said:\n{child.log.read_text()}')
+        samples.append(
+            Sample(elapsed_s / 60, node.rss_mb(), player.rss_mb(), len(infos), len(done), len(poses))
+        )  # fmt: skip
+        opened.spin_for(period_s)
+    return samples
+
+
+def slope(samples: list[Sample]) -> float:
+    """MiB a minute of the node's memory, least squares, once it has settled."""
+    settled = [sample for sample in samples if sample.minutes >= SETTLING * samples[-1].minutes]
+    return float(np.polyfit([s.minutes for s in settled], [s.rss_mb for s in settled], 1)[0])
+
+
+def print_table(samples: list[Sample], rows: int) -> None:
+    """Some of the samples, the first and the last among them, and what follows from all."""
+    print('| minute | node MB | player MB | frames in | processed | poses |\n|---|---|---|---|---|---|')
+    for i in sorted(set(np.linspace(0, len(samples) - 1, rows).round().astype(int))):
+        s = samples[i]
+        print(f'| {s.minutes:.1f} | {s.rss_mb:.0f} | {s.player_mb:.0f} | {s.frames_in} | {s.processed} | {s.poses} |')
+    first, last = samples[0], samples[-1]
+    frames_in, processed = last.frames_in - first.frames_in, last.processed - first.processed
+    print(f'\nNode: {slope(samples):+.2f} MB a minute after the first {SETTLING:.0%} of the time, '
+          f'{max(s.rss_mb for s in samples):.0f} MB at most. {frames_in} frames in, {processed} processed, '
+          f'{last.poses - first.poses} of them with a pose, {frames_in - processed} dropped.')  # fmt: skip
+
+
+def main() -> None:
+    """Play, watch, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('source', nargs='?', default='synthetic')
+    parser.add_argument('--minutes', type=float, default=30.0)
+    parser.add_argument('--preset', default='quick')
+    parser.add_argument('--width', type=int, default=320)
+    parser.add_argument('--max-frames', type=int, default=150)
+    args = parser.parse_args()
+    period_s = min(5.0, args.minutes * 60 / 20)
+    with tempfile.TemporaryDirectory() as scratch:
+        convert(args.source, bag := Path(scratch) / 'bag', args.width, args.max_frames)
+        with graph(Path(scratch) / 'logs') as opened:
+            node = opened.start_node(args.preset)
+            player = opened.start_player(bag, '--loop')
+            samples = watch(opened, node, player, args.minutes, period_s)
+            warnings = [line for line in node.log.read_text().splitlines() if '[WARN]' in line or '[ERROR]' in line]
+    title = f'{Path(args.source).name}, {args.minutes:g} minutes of looping, preset `{args.preset}`'
+    print_header(f'{title}, {args.width} pixels wide', 1)
+    print_table(samples, rows=16)
+    print(f'\nThe node warned {len(warnings)} times' + (f', last: {warnings[-1]}' if warnings else '.'))
+
+
+if __name__ == '__main__':
+    main()
