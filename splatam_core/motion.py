@@ -12,6 +12,7 @@ from splatam_core import se3
 Matrix = NDArray[np.float64]
 # Pose [4, 4] of the camera at the second stamp (ns) in the camera at the first, by another sensor; None: not known.
 MotionPrior = Callable[[int, int], 'Matrix | None']
+CARRIED_ON = 5  # times the interval a velocity was seen over: after a longer gap nobody knows what the camera did meanwhile
 
 
 class MotionModel:
@@ -26,6 +27,7 @@ class MotionModel:
         self._constant_velocity = constant_velocity
         self._prior = prior
         self._stamp_ns = 0
+        self._interval_ns = 0
         self._T_world_cam: Matrix = np.eye(4)
         self._velocity = np.zeros(6)  # twist per second, in the camera's frame
 
@@ -38,13 +40,15 @@ class MotionModel:
         """[4, 4] camera to world at a stamp."""
         if self._prior and self._stamp_ns and (step := self._prior(self._stamp_ns, stamp_ns)) is not None:
             return self._T_world_cam @ step
-        return self._T_world_cam @ se3.exp(self._velocity * (stamp_ns - self._stamp_ns) * 1e-9)
+        elapsed_ns = min(stamp_ns - self._stamp_ns, CARRIED_ON * self._interval_ns)
+        return self._T_world_cam @ se3.exp(self._velocity * elapsed_ns * 1e-9)
 
     def observe(self, stamp_ns: int, T_world_cam: Matrix) -> None:
         """Learn where the camera was."""
         if self._constant_velocity and self._stamp_ns:
             step = se3.log(se3.inverse(self._T_world_cam) @ T_world_cam)
-            self._velocity = step / ((stamp_ns - self._stamp_ns) * 1e-9)
+            self._interval_ns = stamp_ns - self._stamp_ns
+            self._velocity = step / (self._interval_ns * 1e-9)
         self._stamp_ns, self._T_world_cam = stamp_ns, T_world_cam
 
     def place(self, T_world_cam: Matrix) -> None:

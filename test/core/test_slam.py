@@ -285,6 +285,16 @@ def test_motion_is_carried_on_by_stamps() -> None:
     np.testing.assert_allclose(motion.predict(1_099_000_000), start @ se3.exp(step), atol=1e-12)
 
 
+def test_motion_is_not_carried_on_for_ever() -> None:
+    """Five intervals at most: a gap in the stamps must not send the camera through the wall."""
+    step = np.array([0.02, 0.0, 0.01, 0.0, 0.03, 0.0])
+    motion = MotionModel(constant_velocity=True)
+    motion.observe(1_000_000_000, np.eye(4))
+    motion.observe(1_100_000_000, se3.exp(step))
+    for gap_ns in (500_000_000, 600_000_000, 500_000_000_000):
+        np.testing.assert_allclose(motion.predict(1_100_000_000 + gap_ns), se3.exp(6 * step), atol=1e-9)
+
+
 def test_last_pose_model_stays() -> None:
     motion = MotionModel(constant_velocity=False)
     motion.observe(1, np.eye(4))

@@ -273,7 +273,7 @@ def test_bad_input_is_a_warning_each_and_the_node_goes_on(graph: Graph, frames: 
     nothing = replace(wide, stamp_ns=last_ns + 1000, depth_m=np.full_like(wide.depth_m, np.nan))
     send_bad('lost', frame=nothing, depth__data=nan_depth(wide))
     send_bad('dropped', 'stamp', frame=replace(wide, stamp_ns=stamps.to_ns(done[-1].stamp)))
-    send_bad('left out', 'not after the last one', frame=replace(wide, stamp_ns=10**6))
+    send_bad('dropped', 'older than the last frame', frame=replace(wide, stamp_ns=stamps.to_ns(done[-1].stamp) - 10**8 // 2))
 
     assert node.is_running
     node.send(signal.SIGINT)
