@@ -58,8 +58,8 @@ class AlignmentTracker:
         depth = np.where(view.valid, view.depth, np.float32(np.nan))
         frames = self._levels(_Picture(view.camera, _brightness(view.rgb8.numpy().astype(np.float32) / 255), depth))
         references = self._levels(_reference(view.camera, render, self._config.silhouette_threshold))
-        from_before = np.eye(4) if T_cam_world_before is None else T_cam_world @ se3.inverse(T_cam_world_before)
-        alignment = self._align(references, frames, from_before)
+        before = None if T_cam_world_before is None else T_cam_world @ se3.inverse(T_cam_world_before)
+        alignment = self._align(references, frames, before)
         fit = alignment.fit
         readings = int(np.isfinite(frames[0].depth).sum())
         sure_fraction, inlier_fraction = fit.compared / max(1, readings), fit.agreeing / max(1, fit.compared)
@@ -81,14 +81,17 @@ class AlignmentTracker:
             picture = _Picture(camera, *self._aligner.halve(picture.brightness, picture.depth, _EDGE))
             yield picture
 
-    def _align(self, references: list[_Picture], frames: list[_Picture], from_before: Matrix) -> _Alignment:
-        """Coarse to fine; the first guess where that explains the finest level better."""
+    def _align(self, references: list[_Picture], frames: list[_Picture], before: Matrix | None) -> _Alignment:
+        """Coarse to fine; the first guess where that explains the finest level better.
+
+        ``before`` is the motion [4, 4] from the camera a frame ago to the first guess, if that is known.
+        """
         guess = state = _State(np.eye(4))
         scales, free = _FIRST_SCALES, self._free_unknowns()
         for reference, frame in zip(reversed(references), reversed(frames), strict=True):
             layers = self._aligner.layers(frame.brightness, frame.depth, _EDGE)
             for _ in range(self._config.iterations):
-                state = state.moving_at(se3.log(state.motion @ from_before))
+                state = state if before is None else state.moving_at(se3.log(state.motion @ before))
                 fit = self._fit(reference, layers, state, scales)
                 step, scales = fit.step(state, free), fit.scales
                 if step is None:

@@ -219,6 +219,25 @@ def test_alignment_takes_up_what_the_exposure_does(room: tuple[list[RgbdFrame], 
     assert 'agrees with the map' in without.failure
 
 
+@pytest.mark.parametrize('lag', [True, False])
+def test_colour_that_lags_depth_is_noticed(lag: bool, room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """Depth of one frame with colour of the next: each place is found. A single pose is half the way off from one."""
+    frames, truth = room
+    slam = _slam('mapping.iterations=30')
+    for frame in frames[:5]:
+        slam.process(frame)
+    mixed = dataclasses.replace(frames[6], rgb=frames[7].rgb)
+    tracker = make_tracker(make_rasterizer('cpu', 1), TrackingConfig(method='align', iterations=12, lag=lag))
+    view = View.from_frame(mixed, slam.config.depth)
+    result = tracker.track(view, slam.map.gaussians, se3.inverse(truth[5]), se3.inverse(truth[4]))
+    errors = [
+        np.linalg.norm(se3.rotation_vector((found @ truth[index])[:3, :3]))
+        for found, index in ((result.T_cam_world, 7), (result.T_cam_world_depth, 6))
+    ]
+    step = np.linalg.norm(se3.rotation_vector((se3.inverse(truth[6]) @ truth[7])[:3, :3]))
+    assert (max(errors) < 0.5 * step) == lag
+
+
 def test_alignment_to_a_blank_wall_stays_where_it_was_told(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
     """Nothing tells where along it the camera is; least of all may the steps run away."""
     frames, _ = room
