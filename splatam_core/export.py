@@ -15,7 +15,13 @@ from splatam_core.camera import PinholeCamera
 from splatam_core.errors import ExportError
 from splatam_core.rasterizer import Gaussians, Rasterizer
 
-TRUNCATION_VOXELS = 4
+TRUNCATION_VOXELS = 4.0
+MIN_VIEWS = 3
+"""So many renders must show a voxel before it is surface; fewer where there are fewer."""
+
+BLOCK_SIDE, BLOCKS = 16, 10_000
+"""Voxels along a block, and blocks to begin with; the grid grows."""
+
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,28 +72,22 @@ def fused_mesh(
     Raises:
         ExportError: Open3D is not installed, or there is no surface.
     """
-    open3d = _open3d()
-    integration = open3d.pipelines.integration
-    volume = integration.ScalableTSDFVolume(
-        voxel_m, TRUNCATION_VOXELS * voxel_m, integration.TSDFVolumeColorType.RGB8
-    )
-    intrinsic = open3d.camera.PinholeCameraIntrinsic(
-        camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
-    )
-    map_only = gaussians.detached()
+    core = (open3d := _open3d()).core
+    names, channels = ('tsdf', 'weight', 'color'), (1, 1, 3)
+    volume = open3d.t.geometry.VoxelBlockGrid(names, [core.float32] * 3, channels, voxel_m, BLOCK_SIDE, BLOCKS, core.Device('CPU:0'))
+    intrinsic, map_only = core.Tensor(camera.matrix), gaussians.detached()
     for index in progress(range(len(poses))):
         T_cam_world = se3.inverse(poses[index])
         with torch.no_grad():
             view = rasterizer.render(map_only, camera, torch.from_numpy(T_cam_world).float()).images()
-        image = open3d.geometry.RGBDImage.create_from_color_and_depth(
-            open3d.geometry.Image(view.rgb), open3d.geometry.Image(view.depth_m), depth_scale=1.0,
-            depth_trunc=max_depth_m, convert_rgb_to_intensity=False,
-        )  # fmt: skip
-        volume.integrate(image, intrinsic, T_cam_world)
-    mesh = volume.extract_triangle_mesh()
-    if len(mesh.triangles) == 0:
+        depth, color = (open3d.t.geometry.Image(core.Tensor(image)) for image in (view.depth_m[..., None], view.rgb / np.float32(255)))
+        place = intrinsic, core.Tensor(T_cam_world), 1.0, max_depth_m, TRUNCATION_VOXELS
+        blocks = volume.compute_unique_block_coordinates(depth, *place)
+        volume.integrate(blocks, depth, color, intrinsic, *place)
+    mesh = volume.extract_triangle_mesh(weight_threshold=min(MIN_VIEWS, len(poses)) - 0.5)
+    if mesh.is_empty() or len(mesh.triangle.indices) == 0:
         raise ExportError(f'no surface within {max_depth_m:g} m of the {len(poses)} poses: is the map empty?')
-    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.vertex_colors), np.asarray(mesh.triangles))
+    return Surface(mesh.vertex.positions.numpy(), mesh.vertex.colors.numpy(), mesh.triangle.indices.numpy())
 
 
 def _open3d() -> Any:

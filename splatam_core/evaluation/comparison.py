@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from splatam_core.evaluation import plots, report
-from splatam_core.evaluation.descriptions import DESCRIPTIONS, Description
+from splatam_core.evaluation.descriptions import BY_NAME, Description
 from splatam_core.evaluation.metrics import Metrics
 from splatam_core.run_folder import RunRecord
 
@@ -27,7 +27,6 @@ COLUMNS = (
 PREFIXES = {'heldout_': 'held out: ', 'novel_': 'novel: ', 'splatam_': 'as original: '}
 BARS = ('ate_rmse_m', 'psnr_db', 'depth_l1_m', 'fps', 'num_gaussians', 'peak_rss_mb')
 COLORS = ('#1769e0', '#d6409f', '#30a46c', '#f5a524', '#8e4ec6', '#00a2c7', '#e5484d', '#6b7480')
-BY_NAME = {description.name: description for group in DESCRIPTIONS.values() for description in group}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

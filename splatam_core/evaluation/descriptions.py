@@ -109,3 +109,5 @@ DESCRIPTIONS: dict[str, tuple[Description, ...]] = {
     'Novel views without holes, as the original counts': _original('splatam_novel_'),
 }  # fmt: skip
 """Every number, by heading. ``timings_ms`` and ``notes`` are tables of their own."""
+
+BY_NAME = {description.name: description for group in DESCRIPTIONS.values() for description in group}

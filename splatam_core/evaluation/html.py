@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from splatam_core import environment
 from splatam_core.config import SlamConfig, flat_values, settings
 from splatam_core.evaluation import plots, report
-from splatam_core.evaluation.descriptions import DESCRIPTIONS, Description
+from splatam_core.evaluation.descriptions import BY_NAME, DESCRIPTIONS, Description
 from splatam_core.evaluation.metrics import Metrics
 from splatam_core.evaluation.score import Evaluation, Sample
 from splatam_core.files import replace_text
@@ -33,7 +33,7 @@ VARIABLES = {
 }  # fmt: skip
 """Colours of the charts, and the variables of the page that take their place: they differ between light and dark."""
 
-STYLE = {**report.STYLE, 'svg.fonttype': 'none', 'axes.titlesize': 11, 'figure.constrained_layout.use': True}
+STYLE = {**report.STYLE, 'svg.fonttype': 'none', 'axes.titlesize': 11, 'savefig.facecolor': 'none'}
 JPEG_QUALITY = 88
 Draw = Callable[[Figure, Evaluation], None]
 
@@ -52,8 +52,8 @@ def html_report(evaluation: Evaluation) -> str:
         subtitle=escape(report.subtitle(evaluation)),
         tiles=''.join(_tiles(evaluation)),
         notes=_notes(evaluation.metrics),
-        paths=_chart(evaluation, _paths, (11.5, 4.4), 'paths'),
-        over_time=_chart(evaluation, _over_time, (11.5, 3.6), 'over time'),
+        paths=_chart(evaluation, _paths, (11.5, 4.0), 'paths'),
+        over_time=_chart(evaluation, _over_time, (11.5, 3.4), 'over time'),
         samples=''.join(_samples(evaluation)) or _nothing('No frames or no map to compare.'),
         scores=_chart(evaluation, _scores, (11.5, 3.2), 'scores'),
         stages=_chart(evaluation, _stages, (11.5, 3.4), 'stages'),
@@ -70,7 +70,8 @@ def _tiles(evaluation: Evaluation) -> Iterator[str]:
 
 
 def _notes(metrics: Metrics) -> str:
-    items = ''.join(f'<li><b>{escape(name)}</b> is not known: {escape(why)}</li>' for name, why in metrics.notes.items())
+    notes = [(BY_NAME[name].label if name in BY_NAME else name, why) for name, why in metrics.notes.items()]
+    items = ''.join(f'<li><b>{escape(label)}</b> is not known: {escape(why)}</li>' for label, why in notes)
     return f'<ul class="notes">{items}</ul>' if items else ''
 
 
@@ -84,7 +85,7 @@ def _nothing(text: str) -> str:
 def _chart(evaluation: Evaluation, draw: Draw, size_in: tuple[float, float], name: str) -> str:
     """A figure as SVG that takes its colours from the page."""
     with matplotlib.rc_context({**STYLE, 'svg.hashsalt': name}):  # ids are made of the salt: none occurs twice on a page
-        figure = Figure(figsize=size_in, facecolor='none')
+        figure = Figure(figsize=size_in, facecolor='none', layout='constrained')
         FigureCanvasAgg(figure)
         draw(figure, evaluation)
         buffer = io.StringIO()
@@ -103,15 +104,16 @@ def _for_page(svg: str, name: str) -> str:
 
 
 def _paths(figure: Figure, evaluation: Evaluation) -> None:
-    above, side, error = figure.subplots(1, 3, width_ratios=[1, 1, 0.9])
+    paths, right = figure.subfigures(1, 2, width_ratios=[2.2, 1])
+    above, side = paths.subplots(1, 2)
     line = plots.path_view(above, evaluation, plots.ABOVE)
     plots.path_view(side, evaluation, plots.SIDE)
     if side.get_legend() is not None:
         side.get_legend().remove()
     if line is not None:
-        bar = figure.colorbar(line, ax=[above, side], fraction=0.02, pad=0.01, label='distance to the truth (cm)')
+        bar = paths.colorbar(line, ax=[above, side], fraction=0.03, pad=0.02, label='distance to the truth (cm)')
         bar.outline.set_visible(False)
-    plots.position_error(error, evaluation)
+    plots.position_error(right.subplots(), evaluation)
 
 
 def _over_time(figure: Figure, evaluation: Evaluation) -> None:
@@ -192,7 +194,7 @@ def _timings(metrics: Metrics) -> str:
         f'<tr><td>{escape(stage)}</td><td class="n">{times.median:.1f}</td><td class="n">{times.p95:.1f}</td></tr>'
         for stage, times in metrics.timings_ms.items()
     )
-    return f'<table><tr><th>stage</th><th class="n">median ms</th><th class="n">95 % below ms</th></tr>{rows}</table>'
+    return f'<table class="narrow"><tr><th>stage</th><th class="n">median ms</th><th class="n">95 % below ms</th></tr>{rows}</table>'
 
 
 def _metrics(metrics: Metrics) -> Iterator[str]:
@@ -204,7 +206,8 @@ def _metrics(metrics: Metrics) -> Iterator[str]:
 
 
 def _metric(description: Description, metrics: Metrics) -> str:
-    unit = f' <span>{escape(description.unit)}</span>' if description.unit else ''
+    is_known = metrics.values()[description.name] is not None
+    unit = f' <span>{escape(description.unit)}</span>' if description.unit and is_known else ''
     note = metrics.notes.get(description.name)
     meaning = escape(description.meaning) + (f' <i>Not known: {escape(note)}</i>' if note else '')
     return (

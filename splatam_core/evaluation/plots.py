@@ -99,7 +99,7 @@ def coordinates_over_time(axes: NDArray[np.object_], evaluation: Evaluation) -> 
             truth_s, truth_m = _truth_in_span(evaluation, evaluation.truth)
             ax.plot(truth_s, truth_m[:, axis], color=TRUTH, lw=3, label='truth')
         curve = _broken(evaluation, run.trajectory.stamps_ns, stamps_s, centres[:, axis])
-        ax.plot(*curve, color=ESTIMATE, lw=1.3, label='estimate')
+        ax.plot(*curve, color=ESTIMATE, lw=1.3, label='estimate', marker='.' if len(centres) == 1 else None)
         _mark_lost(ax, evaluation)
         ax.set_ylabel(name)
         ax.yaxis.set_major_locator(MaxNLocator(4))
@@ -153,9 +153,10 @@ def stage_times(ax: Axes, evaluation: Evaluation) -> None:
     stages = [stage for stage in STAGES if stage in STAGE_COLORS]
     times_ms = np.array([[getattr(record.timings, stage) for record in records] for stage in stages])
     medians = np.median(times_ms, axis=1)
+    edges, until_last = np.arange(len(records) + 1) - 0.5, np.concatenate([times_ms, times_ms[:, -1:]], axis=1)
     ax.stackplot(
-        np.arange(len(records)), times_ms, colors=[STAGE_COLORS[stage] for stage in stages], lw=0, alpha=0.85,
-        labels=[f'{stage}  {median:.0f} ms' for stage, median in zip(stages, medians)], step='mid',
+        edges, until_last, colors=[STAGE_COLORS[stage] for stage in stages], lw=0, alpha=0.85,
+        labels=[f'{stage}  {median:.0f} ms' for stage, median in zip(stages, medians)], step='post',
     )  # fmt: skip
     ax.set_xlim(-0.5, len(records) - 0.5)
     ax.set_ylim(0, max(1e-3, float(np.percentile(times_ms.sum(axis=0), 99)) * 1.35))

@@ -107,7 +107,7 @@ def _plain(text: str) -> str:
 def headline(evaluation: Evaluation) -> list[tuple[str, str, str]]:
     """The numbers to see first: (value, unit, name) of the headline numbers; an en dash where one is not known."""
     m = evaluation.metrics
-    every = f', every {m.evaluated_every}th frame' if m.evaluated_every and m.evaluated_every > 1 else ''
+    every = f', 1 in {m.evaluated_every} frames' if m.evaluated_every and m.evaluated_every > 1 else ''
     return [
         (_digits(m.ate_rmse_m, 100, 2), 'cm', 'ATE RMSE'),
         (_digits(m.psnr_db, 1, 2), 'dB', f'PSNR{every}'),

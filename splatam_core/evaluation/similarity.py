@@ -85,7 +85,7 @@ def load_lpips() -> Lpips | str:
     try:
         import lpips
     except ImportError as error:
-        return f"{error}; pip install 'splatam_ros[lpips]', with the torchvision that fits the installed torch"
+        return f"{error}: pip install 'splatam_ros[lpips]', with the torchvision that fits the installed torch"
     except RuntimeError as error:  # torchvision built for another torch
         return f'torchvision does not fit the installed torch: {_first_line(error)}'
     try:
