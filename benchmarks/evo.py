@@ -3,9 +3,9 @@
     python -m venv evo-venv && evo-venv/bin/pip install evo
     python benchmarks/evo.py RUN --evo evo-venv/bin
 
-evo reads two TUM trajectories, both written here: the estimate, and the truth interpolated at its stamps, so that what is
-compared is alignment and statistics and not how stamps are matched. RUN is a folder whose source has true poses, every
-frame tracked.
+evo reads two TUM trajectories, both written here: the estimate, and the truth interpolated at its stamps, so that
+alignment and statistics are compared and not how stamps are matched. RUN is a folder whose source has true poses,
+every frame tracked.
 """
 
 from __future__ import annotations

@@ -23,7 +23,6 @@ BLOCK_SIDE, BLOCKS = 16, 10_000
 """Voxels along a block, and blocks to begin with; the grid grows."""
 
 
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
     """Points, or a mesh.
@@ -74,13 +73,18 @@ def fused_mesh(
     """
     core = (open3d := _open3d()).core
     names, channels = ('tsdf', 'weight', 'color'), (1, 1, 3)
-    volume = open3d.t.geometry.VoxelBlockGrid(names, [core.float32] * 3, channels, voxel_m, BLOCK_SIDE, BLOCKS, core.Device('CPU:0'))
+    volume = open3d.t.geometry.VoxelBlockGrid(
+        names, [core.float32] * 3, channels, voxel_m, BLOCK_SIDE, BLOCKS, core.Device('CPU:0')
+    )
     intrinsic, map_only = core.Tensor(camera.matrix), gaussians.detached()
     for index in progress(range(len(poses))):
         T_cam_world = se3.inverse(poses[index])
         with torch.no_grad():
             view = rasterizer.render(map_only, camera, torch.from_numpy(T_cam_world).float()).images()
-        depth, color = (open3d.t.geometry.Image(core.Tensor(image)) for image in (view.depth_m[..., None], view.rgb / np.float32(255)))
+        depth, color = (
+            open3d.t.geometry.Image(core.Tensor(image))
+            for image in (view.depth_m[..., None], view.rgb / np.float32(255))
+        )
         place = intrinsic, core.Tensor(T_cam_world), 1.0, max_depth_m, TRUNCATION_VOXELS
         blocks = volume.compute_unique_block_coordinates(depth, *place)
         volume.integrate(blocks, depth, color, intrinsic, *place)

@@ -73,9 +73,7 @@ def _faded(rates: Rates, factor: float) -> Rates:
     return Rates(*(factor * rate for rate in (rates.means, rates.log_scales, rates.logit_opacities, rates.rgb)))
 
 
-def _endless(
-    sequence: Sequence, poses: Mapping[int, NDArray[np.float64]], config: SlamConfig
-) -> Iterator[PosedView]:
+def _endless(sequence: Sequence, poses: Mapping[int, NDArray[np.float64]], config: SlamConfig) -> Iterator[PosedView]:
     """All frames in random order, then all in another, and so on."""
     rng, indices = np.random.default_rng(config.seed), np.arange(len(sequence))
     while len(indices):

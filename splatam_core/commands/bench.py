@@ -14,9 +14,15 @@ from splatam_core.errors import RunFolderError
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_source_arguments(parser)
-    parser.add_argument('--presets', required=True, metavar='A,B', help='shipped presets or .yaml files, with commas between')
     parser.add_argument(
-        '--set', action='append', default=[], metavar='KEY=VALUE', help='change a setting of all; may be given several times'
+        '--presets', required=True, metavar='A,B', help='shipped presets or .yaml files, with commas between'
+    )
+    parser.add_argument(
+        '--set',
+        action='append',
+        default=[],
+        metavar='KEY=VALUE',
+        help='change a setting of all; may be given several times',
     )
     parser.add_argument('--out', type=Path, required=True, metavar='DIR', help='folder for the runs, one below it each')
 
@@ -29,13 +35,27 @@ def bench(args: argparse.Namespace) -> int:
     presets = [preset.strip() for preset in args.presets.split(',') if preset.strip()]
     folders = [args.out / Path(preset).stem for preset in presets]
     if len(set(folders)) < len(folders) or not folders:
-        raise RunFolderError(f"--presets {args.presets}: expected different presets with commas between, like 'quick,tum'")
+        raise RunFolderError(
+            f"--presets {args.presets}: expected different presets with commas between, like 'quick,tum'"
+        )
     for preset in presets:
         load_config(preset, args.set)  # a wrong name is said now, not after an hour
     check_is_free(args.out)
     for preset, folder in zip(presets, folders):
-        command = [sys.executable, '-m', 'splatam_core.cli', 'run', *_source_words(args), '--preset', preset, '--out', folder]
-        done = subprocess.run([*map(str, command), *(word for entry in args.set for word in ('--set', entry))], check=False)
+        command = [
+            sys.executable,
+            '-m',
+            'splatam_core.cli',
+            'run',
+            *_source_words(args),
+            '--preset',
+            preset,
+            '--out',
+            folder,
+        ]
+        done = subprocess.run(
+            [*map(str, command), *(word for entry in args.set for word in ('--set', entry))], check=False
+        )
         if done.returncode != 0:
             raise RunFolderError(f'preset {preset} ended with exit code {done.returncode}; see above')
     print()

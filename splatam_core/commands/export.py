@@ -27,11 +27,21 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument('--overwrite', action='store_true', help='replace FILE')
     parser.add_argument(
-        '--min-opacity', type=_number, default=0.5, metavar='O', help='of points: leave out fainter ones (default: %(default)s)'
+        '--min-opacity',
+        type=_number,
+        default=0.5,
+        metavar='O',
+        help='of points: leave out fainter ones (default: %(default)s)',
     )
-    parser.add_argument('--voxel', type=_number, default=0.01, metavar='M', help='of a mesh: metres (default: %(default)s)')
     parser.add_argument(
-        '--max-depth', type=_number, default=6.0, metavar='M', help='of a mesh: leave out what is farther (default: %(default)s)'
+        '--voxel', type=_number, default=0.01, metavar='M', help='of a mesh: metres (default: %(default)s)'
+    )
+    parser.add_argument(
+        '--max-depth',
+        type=_number,
+        default=6.0,
+        metavar='M',
+        help='of a mesh: leave out what is farther (default: %(default)s)',
     )
     parser.add_argument(
         '--every', type=positive, default=5, metavar='N', help='of a mesh: fuse every n-th frame (default: %(default)s)'

@@ -21,8 +21,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def refine(args: argparse.Namespace) -> int:
     """Optimise a finished map over all frames of its run."""
-    from splatam_core.evaluation.score import score_images
     from splatam_core.evaluation.images import mean_scores
+    from splatam_core.evaluation.score import score_images
     from splatam_core.rasterizer import make_rasterizer
     from splatam_core.refinement import refine_map
     from splatam_core.run_folder import check_is_free, read_run, write_refined

@@ -57,7 +57,11 @@ def comparison_table(runs: Sequence[RunRecord]) -> str:
 
 def _in_common(runs: Sequence[RunRecord], sources: set[str], commits: set[str]) -> str:
     machines = sorted({_machine(run) for run in runs})
-    parts = [*(sources if len(sources) == 1 else []), *(f'commit {c[:18]}' for c in commits if len(commits) == 1), *machines]
+    parts = [
+        *(sources if len(sources) == 1 else []),
+        *(f'commit {c[:18]}' for c in commits if len(commits) == 1),
+        *machines,
+    ]
     return '; '.join(parts)
 
 

@@ -39,12 +39,21 @@ def _images(prefix: str, of: str) -> tuple[Description, ...]:
     return (
         Description(f'{prefix}psnr_db', 'PSNR', 'dB', 1, '.2f', f'Colour, {of}, over the pixels with a depth reading.'),
         Description(f'{prefix}psnr_full_db', 'PSNR, whole image', 'dB', 1, '.2f', f'Colour, {of}, holes included.'),
-        Description(f'{prefix}ssim', 'SSIM', '', 1, '.4f', 'Structural similarity over the pixels with a reading; 1 = alike.'),
+        Description(
+            f'{prefix}ssim', 'SSIM', '', 1, '.4f', 'Structural similarity over the pixels with a reading; 1 = alike.'
+        ),
         Description(f'{prefix}ms_ssim', 'MS-SSIM', '', 1, '.4f', 'The same at five scales, over whole images.'),
-        Description(f'{prefix}lpips', 'LPIPS', '', 1, '.4f', 'Learned distance (AlexNet), over whole images; 0 = alike.'),
+        Description(
+            f'{prefix}lpips', 'LPIPS', '', 1, '.4f', 'Learned distance (AlexNet), over whole images; 0 = alike.'
+        ),
         Description(f'{prefix}depth_l1_m', 'depth L1', 'cm', 100, '.2f', 'Mean absolute difference to the readings.'),
         Description(
-            f'{prefix}depth_rmse_m', 'depth RMSE', 'cm', 100, '.2f', 'Root of the mean squared difference to the readings.'
+            f'{prefix}depth_rmse_m',
+            'depth RMSE',
+            'cm',
+            100,
+            '.2f',
+            'Root of the mean squared difference to the readings.',
         ),
     )
 

@@ -84,7 +84,9 @@ def _nothing(text: str) -> str:
 
 def _chart(evaluation: Evaluation, draw: Draw, size_in: tuple[float, float], name: str) -> str:
     """A figure as SVG that takes its colours from the page."""
-    with matplotlib.rc_context({**STYLE, 'svg.hashsalt': name}):  # ids are made of the salt: none occurs twice on a page
+    with matplotlib.rc_context(
+        {**STYLE, 'svg.hashsalt': name}
+    ):  # ids are made of the salt: none occurs twice on a page
         figure = Figure(figsize=size_in, facecolor='none', layout='constrained')
         FigureCanvasAgg(figure)
         draw(figure, evaluation)

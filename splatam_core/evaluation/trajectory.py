@@ -168,9 +168,7 @@ def splatam_ate_mean_m(estimate: Trajectory, truth: Trajectory) -> float:
     return float(np.linalg.norm(points - (true_points @ T[:3, :3].T + T[:3, 3]), axis=1).mean())
 
 
-def interpolate_poses(
-    truth: Trajectory, stamps_ns: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def interpolate_poses(truth: Trajectory, stamps_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """True poses at some stamps: centres linear in between, rotations at constant angular speed.
 
     Args:
