@@ -39,9 +39,15 @@ class Surface:
 
 
 def centres(gaussians: Gaussians, min_opacity: float) -> Surface:
-    """The centres of the Gaussians that are at least so opaque."""
+    """The centres of the Gaussians that are at least so opaque.
+
+    Raises:
+        ExportError: none is.
+    """
     g = gaussians.detached()
     chosen = torch.sigmoid(g.logit_opacities) >= min_opacity
+    if not chosen.any():
+        raise ExportError(f'none of the {len(g)} Gaussians is at least {min_opacity:g} opaque')
     return Surface(g.means[chosen].numpy(), g.rgb[chosen].numpy())
 
 

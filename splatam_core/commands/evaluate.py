@@ -151,7 +151,9 @@ def print_summary(metrics: Metrics, folder: Path) -> None:
         rows.append(('held out', f'PSNR {scores}; {m.heldout_frames} frames kept out of the map'))
     if m.novel_alignment:
         scores = f'{_text(m.novel.psnr_db, 1, ".2f", "dB")}, depth L1 {_text(m.novel.depth_l1_m, 100, ".2f", "cm")}'
-        rows.append(('novel', f'PSNR {scores}; {m.novel_frames} views, and {m.novel_holes_frames} with holes apart'))
+        rows.append(
+            ('novel', f'PSNR {scores}; {m.novel_frames} views without holes, {m.novel_holes_frames} with apart')
+        )
     rows += [('Gaussians', _text(m.num_gaussians, 1, ',', '')), ('results', str(folder))]
     for name, value in rows:
         print(f'{name:<10} {value}'.rstrip())

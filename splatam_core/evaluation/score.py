@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core import se3
 from splatam_core.datasets.base import Sequence, frame_or_none
 from splatam_core.errors import RunFolderError
 from splatam_core.evaluation.images import FrameScores, ViewScorer, mean_original_scores, mean_scores
@@ -17,6 +16,7 @@ from splatam_core.evaluation.similarity import LPIPS_MIN_SIDE, MIN_SIDE, Lpips, 
 from splatam_core.evaluation.trajectory import (
     RelativePoseError,
     TrajectoryError,
+    align_poses,
     interpolate_poses,
     relative_pose_errors,
     splatam_ate_mean_m,
@@ -246,8 +246,8 @@ def score_novel_views(
         run: the run, made from the train split.
         truth: the train split's true poses.
         test: the test split; its true poses are in the same world.
-        alignment: ``trajectory`` brings the truth into the map by the rigid motion that best fits the run's camera
-            centres (the one of the ATE); ``first`` by the first tracked pose that has a truth, as the original does.
+        alignment: ``trajectory`` brings the truth into the map by all tracked poses that have a truth (their mean
+            rotation, then their mean centre); ``first`` by the first of them alone, as the original does.
         progress: wraps the loop over the test split.
 
     Raises:
@@ -274,13 +274,11 @@ def score_novel_views(
 
 
 def _T_map_truth(run: RunRecord, truth: Trajectory, alignment: str) -> Pose:
-    if alignment == 'trajectory':
-        return trajectory_error(run.trajectory, truth).T_estimate_truth
     poses, known = interpolate_poses(truth, run.trajectory.stamps_ns)
     if not known.any():
         raise RunFolderError(f'none of the {len(run.trajectory)} tracked frames has a true pose at its stamp')
-    first = int(np.argmax(known))
-    return run.trajectory.T_world_cam[first] @ se3.inverse(poses[first])
+    last = None if alignment == 'trajectory' else 1
+    return align_poses(poses[known][:last], run.trajectory.T_world_cam[known][:last])
 
 
 def make_scorer(run: RunRecord, lpips: Lpips | str) -> ViewScorer:

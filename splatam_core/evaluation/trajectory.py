@@ -236,12 +236,35 @@ def align(source: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[n
         T_target_source, [4, 4]. Where the points leave it open (all on one line, say), one of the best.
     """
     mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
-    covariance = (target - mean_target).T @ (source - mean_source)
-    U, _, V_t = np.linalg.svd(covariance)
-    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(V_t))])
+    R = _nearest_rotation((target - mean_target).T @ (source - mean_source))
+    return _motion(R, mean_target - R @ mean_source)
+
+
+def align_poses(source: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rigid motion that brings poses onto others: the mean of their rotations, then of their centres.
+
+    Unlike ``align`` it is well defined for any path, a straight one or one that turns on the spot too.
+
+    Args:
+        source: [N, 4, 4] camera to the source's world, N at least 1.
+        target: [N, 4, 4] the same cameras to the target's world.
+
+    Returns:
+        T_target_source, [4, 4].
+    """
+    R = _nearest_rotation((target[:, :3, :3] @ np.swapaxes(source[:, :3, :3], 1, 2)).sum(axis=0))
+    return _motion(R, (target[:, :3, 3] - source[:, :3, 3] @ R.T).mean(axis=0))
+
+
+def _nearest_rotation(M: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotation R that makes trace(R^T M) largest."""
+    U, _, V_t = np.linalg.svd(M)
+    return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(V_t))]) @ V_t
+
+
+def _motion(R: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
     T = np.eye(4)
-    T[:3, :3] = U @ mirror @ V_t
-    T[:3, 3] = mean_target - T[:3, :3] @ mean_source
+    T[:3, :3], T[:3, 3] = R, t
     return T
 
 

@@ -21,7 +21,8 @@ from splatam_core.config import load_config
 from splatam_core.errors import FrameError, RunFolderError
 from splatam_core.evaluation.descriptions import DESCRIPTIONS
 from splatam_core.evaluation.html import html_report
-from splatam_core.evaluation.metrics import Metrics
+from splatam_core.evaluation.images import OriginalScores
+from splatam_core.evaluation.metrics import GROUPS, Metrics
 from splatam_core.evaluation.report import DPI, WIDTH_IN, write_report
 from splatam_core.evaluation.score import combine, score_images, score_novel_views, score_trajectory
 from splatam_core.ply import write_ply
@@ -31,6 +32,7 @@ from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status, Tra
 
 CONFIG = load_config('quick', ['threads=1'])
 STEP_NS, COUNT, LOST = 33_333_333, 9, 4
+ORIGINAL = [entry.name for entry in dataclasses.fields(OriginalScores)]
 CAMERA = PinholeCamera(48, 36, 40.0, 40.0, 23.5, 17.5)
 T_TRUTH_WORLD = se3.exp(np.array([3.0, -1.0, 2.0, 0.3, 1.0, -0.5]))
 
@@ -232,7 +234,7 @@ def test_a_wrong_first_pose_spoils_the_first_pose_s_alignment_only(tmp_path: Pat
         combine(run, None, None, score_novel_views(run, Wall().ground_truth(), Aside(), how, plain)).metrics.novel.psnr_db
         for how in ('trajectory', 'first')
     )
-    assert by_all > 50 > by_first
+    assert by_all > by_first + 5  # one of eight rotations is wrong: an eighth of it enters the mean
 
 
 # --- the page ---
@@ -304,4 +306,6 @@ def test_every_number_is_described_once() -> None:
     described = [description.name for group in DESCRIPTIONS.values() for description in group]
     assert sorted(described) == sorted(numbers)
     page = (Path(__file__).resolve().parents[2] / 'docs' / 'evaluation.md').read_text()
-    assert [name for name in numbers if f'`{name}`' not in page] == []
+    own = {entry.name for entry in dataclasses.fields(Metrics)} - set(GROUPS) | {f'splatam_{name}' for name in ORIGINAL}
+    assert [name for name in own if f'`{name}`' not in page] == []
+    assert [group for group in GROUPS if f'`{group}_' not in page] == []

@@ -12,6 +12,7 @@ from splatam_core.evaluation.trajectory import (
     STAMP_ROUNDING_NS,
     RelativePoseError,
     align,
+    align_poses,
     interpolate_centres,
     interpolate_poses,
     relative_pose_errors,
@@ -231,3 +232,17 @@ def test_the_original_s_ate_sees_a_turn_with_the_distance_from_the_origin() -> N
     turned = Trajectory(truth.stamps_ns, T)
     assert trajectory_error(turned, truth).rmse_m == pytest.approx(0, abs=ROUND_OFF_M)
     assert splatam_ate_mean_m(turned, truth) > 0.01
+
+
+def test_poses_are_aligned_where_centres_leave_it_open() -> None:
+    """Along a line the centres do not tell how the world is turned about it; the cameras' rotations do."""
+    truth = at_30_hz([se3.exp(np.array([0.1 * i, 0, 0, 0, 0, 0])) for i in range(5)])
+    T = se3.exp(np.array([1.0, 2, 3, 0.4, -0.5, 0.6]))
+    assert np.allclose(align_poses(truth.T_world_cam, transformed(truth, T).T_world_cam), T, atol=ROUND_OFF_M)
+    assert np.allclose(align_poses(truth.T_world_cam[:1], transformed(truth, T).T_world_cam[:1]), T, atol=ROUND_OFF_M)
+
+
+def test_aligned_poses_share_the_error() -> None:
+    truth = wandering(4)
+    off = np.array([[0.03, 0, 0], [-0.03, 0, 0], [0, 0.03, 0], [0, -0.03, 0]])  # cancels out
+    assert np.allclose(align_poses(truth.T_world_cam, moved(truth, off).T_world_cam), np.eye(4), atol=ROUND_OFF_M)
