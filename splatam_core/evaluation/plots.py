@@ -74,6 +74,7 @@ def path_view(ax: Axes, evaluation: Evaluation, projection: Projection = ABOVE) 
     ax.set(title=projection.title, xlabel=projection.labels[0], ylabel=projection.labels[1])
     ax.set_aspect('equal', adjustable='datalim')
     ax.margins(0.08)
+    ax.xaxis.set_major_locator(MaxNLocator(5))
     if projection.flip:
         ax.invert_yaxis()
     return colored
