@@ -106,6 +106,7 @@ setup(
     ext_modules=[native_extension()],
     cmdclass={'build_ext': BuildNative},
     data_files=shared_files(),
+    package_data={'splatam_core.evaluation': ['*.html']},
     python_requires='>=3.10',
     install_requires=[
         'matplotlib>=3.6',
@@ -118,8 +119,10 @@ setup(
     ],
     extras_require={
         'exr': ['OpenEXR>=3.3'],
+        'lpips': ['lpips>=0.1.4'],
+        'mesh': ['open3d>=0.18'],
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
-        'test': ['pytest>=7', 'hypothesis>=6', 'OpenEXR>=3.3'],
+        'test': ['pytest>=7', 'hypothesis>=6', 'OpenEXR>=3.3', 'pytorch-msssim>=1.0'],
     },
     entry_points={
         'console_scripts': [

@@ -1,4 +1,4 @@
-"""``splatam``: the command line. A command is a function, a function that adds its arguments, and a row below."""
+"""``splatam``: the command line. ``run`` is here, every other command a file in ``commands/`` and a row below."""
 
 from __future__ import annotations
 
@@ -7,42 +7,24 @@ import logging
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING
 
+from splatam_core.commands import bench, compare, convert, evaluate, export, refine, render
+from splatam_core.commands.evaluate import print_summary, score_own_run
+from splatam_core.commands.shared import Command, add_source_arguments, open_source, positive, say, source_of
 from splatam_core.errors import DatasetError, FrameError, RunFolderError, SplatamError
 
 # Whatever takes time to import (torch, OpenCV, matplotlib) is imported by the command that needs it.
 if TYPE_CHECKING:
     from splatam_core.datasets.base import Sequence as FrameSequence
-    from splatam_core.evaluation.metrics import Metrics
-    from splatam_core.run_folder import RunFolder, RunRecord, Source
+    from splatam_core.run_folder import RunFolder
     from splatam_core.slam import Slam
-    from splatam_core.types import Trajectory
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
-BAG_SUFFIXES = ('.db3', '.mcap', '.bag')
-
-
-@dataclass(frozen=True, slots=True)
-class Command:
-    """A subcommand.
-
-    Attributes:
-        name: as typed.
-        help: one line.
-        add_arguments: declares its arguments.
-        run: does it; returns the exit code.
-    """
-
-    name: str
-    help: str
-    add_arguments: Callable[[argparse.ArgumentParser], None]
-    run: Callable[[argparse.Namespace], int]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -74,13 +56,17 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
-    _add_source_arguments(parser)
+    add_source_arguments(parser)
     parser.add_argument('--preset', default='splatam', help='a shipped preset or a .yaml file (default: %(default)s)')
     parser.add_argument(
         '--set', action='append', default=[], metavar='KEY=VALUE', help='change a setting; may be given several times'
     )
     parser.add_argument('--out', type=Path, required=True, metavar='DIR', help='folder for the results')
     parser.add_argument('--overwrite', action='store_true', help='replace the run that is in DIR')
+    parser.add_argument(
+        '--holdout', type=positive, metavar='N',
+        help='track every n-th frame, but keep it out of the map to score it on; the same as --set mapping.hold_out=N',
+    )  # fmt: skip
     parser.add_argument('--no-evaluate', action='store_true', help='leave out scores of images and truth, and report')
 
 
@@ -90,10 +76,11 @@ def run(args: argparse.Namespace) -> int:
     from splatam_core.run_folder import RunDescription, RunFolder, read_run
     from splatam_core.slam import Slam
 
-    config = load_config(args.preset, args.set)
+    held_out = [f'mapping.hold_out={args.holdout}'] if args.holdout else []
+    config = load_config(args.preset, [*args.set, *held_out])
     apply_threads(config)
-    source = _source(args)
-    sequence = _open(source)
+    source = source_of(args)
+    sequence = open_source(source)
     description = RunDescription('splatam run', args.preset, source)
     folder = RunFolder.create(args.out, config, description, overwrite=args.overwrite)
     with folder, _StopRequest() as stop:
@@ -101,27 +88,18 @@ def run(args: argparse.Namespace) -> int:
         failure = _process(sequence, slam, folder, stop)
         metrics = folder.finish(slam)
     if failure is not None:
-        _say(f'what was done before the error is in {args.out}')
+        say(f'what was done before the error is in {args.out}')
         raise failure
     if stop.requested:
-        _say(f'stopped after {metrics.frames} of {len(sequence)} frames; all of it is in {args.out}')
-        _say(f"'splatam evaluate {args.out}' scores it")
+        say(f'stopped after {metrics.frames} of {len(sequence)} frames; all of it is in {args.out}')
+        say(f"'splatam evaluate {args.out}' scores it")
         return EXIT_INTERRUPTED
     if metrics.frames == 0:
         raise RunFolderError(f'{sequence.name}: not one of its {len(sequence)} frames could be used; see above')
     if not args.no_evaluate:
-        metrics = _score_own_run(read_run(args.out), sequence)
-    _print_summary(metrics, args.out)
+        metrics = score_own_run(read_run(args.out), sequence)
+    print_summary(metrics, args.out)
     return 0
-
-
-def _score_own_run(run: RunRecord, sequence: FrameSequence) -> Metrics:
-    """Score a run just done; where too little was tracked to compare with the truth, the images only."""
-    try:
-        return _score(run, sequence.ground_truth(), sequence, every=1)
-    except RunFolderError as error:
-        _say(f'no trajectory error: {error}')
-        return _score(run, None, sequence, every=1)
 
 
 class _StopRequest:
@@ -142,7 +120,7 @@ class _StopRequest:
     def _request(self, number: int, frame: FrameType | None) -> None:
         self.requested = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        _say('stopping after this frame; Ctrl-C again stops at once, without saving the map')
+        say('stopping after this frame; Ctrl-C again stops at once, without saving the map')
 
 
 def _process(sequence: FrameSequence, slam: Slam, folder: RunFolder, stop: _StopRequest) -> DatasetError | None:
@@ -160,7 +138,7 @@ def _process(sequence: FrameSequence, slam: Slam, folder: RunFolder, stop: _Stop
                 decoded_s = time.perf_counter()
                 result = slam.process(frame)
             except FrameError as error:
-                _say(f'frame {index} is left out: {error}')
+                say(f'frame {index} is left out: {error}')
                 continue
             except DatasetError as error:
                 return error
@@ -170,190 +148,15 @@ def _process(sequence: FrameSequence, slam: Slam, folder: RunFolder, stop: _Stop
     return None
 
 
-# --- evaluate ---
-
-
-def _add_evaluate_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('dir', type=Path, metavar='DIR', help="folder of a run, the command line's or the node's")
-    parser.add_argument(
-        '--truth', metavar='FILE|BAG|DATASET', help="TUM trajectory, bag or dataset (default: the run's own source)"
-    )
-    parser.add_argument(
-        '--every', type=_positive, default=1, metavar='N', help='score the images of every n-th frame only'
-    )
-
-
-def evaluate(args: argparse.Namespace) -> int:
-    """``splatam evaluate``: score a run and draw its report."""
-    from splatam_core.config import apply_threads
-    from splatam_core.run_folder import MAP, read_run
-
-    run = read_run(args.dir)
-    apply_threads(run.config)
-    truth, sequence = _truth_and_frames(run, args.truth)
-    if sequence is not None and not (run.path / MAP).is_file():
-        _say(f'{run.path} has no {MAP}, the run ended before it was saved: trajectory only')
-        sequence = None
-    _print_summary(_score(run, truth, sequence, args.every), args.dir)
-    return 0
-
-
-def _truth_and_frames(run: RunRecord, given: str | None) -> tuple[Trajectory | None, FrameSequence | None]:
-    """What to score against. The run's own source shows the frames where it can be opened."""
-    from splatam_core.run_folder import Source
-    from splatam_core.trajectory import read_trajectory
-
-    if given is None:
-        if run.description.source is None:
-            raise RunFolderError(f'{run.path} does not say where its frames came from: pass --truth FILE|BAG|DATASET')
-        sequence = _open(run.description.source)
-        return sequence.ground_truth(), sequence
-    own = _open_own_source(run)
-    if Path(given).is_file() and Path(given).suffix not in BAG_SUFFIXES:
-        return read_trajectory(Path(given)), own
-    other = _open(Source(given, width=run.camera.width if run.camera else None))
-    truth = other.ground_truth()
-    if truth is None:
-        _say(f'{given} has no true poses: images only')
-    return truth, other if own is None else own
-
-
-def _open_own_source(run: RunRecord) -> FrameSequence | None:
-    if run.description.source is None:
-        return None
-    try:
-        return _open(run.description.source)
-    except SplatamError as error:
-        _say(f"the run's own source is not used: {error}")
-        return None
-
-
-def _score(run: RunRecord, truth: Trajectory | None, sequence: FrameSequence | None, every: int) -> Metrics:
-    """Score, then write ``metrics.json`` and ``report.png``; an error leaves both as they are."""
-    from splatam_core.evaluation.report import write_report
-    from splatam_core.evaluation.score import combine, score_images, score_trajectory
-    from splatam_core.files import replace_text
-    from splatam_core.run_folder import METRICS, REPORT
-
-    against_truth = None if truth is None else score_trajectory(run, truth)
-    against_images = None if sequence is None else score_images(run, sequence, every, _progress('scoring'))
-    evaluation = combine(run, against_truth, against_images)
-    replace_text(run.path / METRICS, evaluation.metrics.to_json())
-    write_report(evaluation, run.path / REPORT)
-    return evaluation.metrics
-
-
-# --- convert ---
-
-
-def _add_convert_arguments(parser: argparse.ArgumentParser) -> None:
-    _add_source_arguments(parser)
-    parser.add_argument('bag', type=Path, metavar='BAG', help='folder of the rosbag2 to write')
-    parser.add_argument('--storage', choices=('sqlite3', 'mcap'), default='sqlite3', help='default: %(default)s')
-    parser.add_argument('--compressed', action='store_true', help='JPEG colour and PNG depth')
-
-
-def convert(args: argparse.Namespace) -> int:
-    """``splatam convert``: write a recording as a rosbag2."""
-    from splatam_core.datasets.convert import write_bag
-
-    sequence = _open(_source(args))
-    write_bag(sequence, args.bag, storage=args.storage, compressed=args.compressed, progress=_progress('writing'))
-    print(f'{len(sequence)} frames of {sequence.name} are in {args.bag}')
-    return 0
-
-
-# --- shared ---
-
-
-def _add_source_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        'source', metavar='SOURCE', help='dataset folder, bag (folder, .db3, .mcap, ROS 1 .bag), synthetic[:seed=0,...]'
-    )
-    parser.add_argument('--format', metavar='F', help='reader to use (default: guessed from SOURCE)')
-    parser.add_argument('--start', type=int, default=0, metavar='N', help='leave out the first N frames')
-    parser.add_argument('--max-frames', type=_positive, metavar='N', help='read at most N frames')
-    parser.add_argument('--stride', type=_positive, default=1, metavar='N', help='read every n-th frame only')
-    parser.add_argument('--width', type=_positive, metavar='W', help='resize the frames to W pixels across')
-    parser.add_argument('--crop', type=int, default=0, metavar='P', help='cut P pixels off each edge, after resizing')
-    parser.add_argument('--split', choices=('train', 'test'), help='of Replica-V2 and ScanNet++ (default: train)')
-    parser.add_argument('--skip-bad', action='store_true', help='leave out what ScanNet++ flags as bad')
-    for topic, what in (('rgb', 'colour'), ('depth', 'depth'), ('info', 'camera info')):
-        parser.add_argument(f'--{topic}', metavar='TOPIC', help=f'{what} topic of a bag (default: found by type)')
-
-
-def _source(args: argparse.Namespace) -> Source:
-    from splatam_core.run_folder import Source
-
-    path = str(Path(args.source).resolve()) if Path(args.source).exists() else args.source
-    return Source(
-        path, args.format, args.start, args.max_frames, args.width, args.rgb, args.depth, args.info,
-        args.stride, args.crop, args.split, args.skip_bad,
-    )  # fmt: skip
-
-
-def _open(source: Source) -> FrameSequence:
-    from splatam_core.datasets.base import BagTopics
-    from splatam_core.datasets.registry import open_sequence
-
-    return open_sequence(
-        source.path,
-        format=source.format,
-        width=source.width,
-        start=source.start,
-        max_frames=source.max_frames,
-        topics=BagTopics(source.rgb, source.depth, source.info),
-        stride=source.stride,
-        crop=source.crop,
-        split=source.split,
-        skip_bad=source.skip_bad,
-    )
-
-
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f'{value} is not at least 1')
-    return value
-
-
-def _progress(what: str) -> Callable[[range], Iterable[int]]:
-    """Wraps a loop over frames in a progress bar that goes away when it is done."""
-    from tqdm import tqdm
-
-    return lambda indices: tqdm(indices, unit='frame', desc=what, dynamic_ncols=True, leave=False, disable=None)
-
-
-def _say(text: str) -> None:
-    """To the user, beside results and above a progress bar."""
-    from tqdm import tqdm
-
-    tqdm.write(f'splatam: {text}', file=sys.stderr)
-
-
-def _print_summary(metrics: Metrics, folder: Path) -> None:
-    rows = [
-        ('tracked', f'{metrics.tracked} of {metrics.frames} frames'),
-        ('speed', _text(metrics.fps, 1, '.2f', 'fps, decoding excluded')),
-        ('ATE RMSE', _text(metrics.ate_rmse_m, 100, '.2f', 'cm')),
-        ('PSNR', _text(metrics.psnr_db, 1, '.2f', 'dB')),
-        ('SSIM', _text(metrics.ssim, 1, '.3f', '')),
-        ('depth L1', _text(metrics.depth_l1_m, 100, '.2f', 'cm')),
-        ('Gaussians', _text(metrics.num_gaussians, 1, ',', '')),
-        ('results', str(folder)),
-    ]
-    for name, value in rows:
-        print(f'{name:<10} {value}'.rstrip())
-
-
-def _text(value: float | None, factor: float, digits: str, unit: str) -> str:
-    return 'not known' if value is None else f'{value * factor:{digits}} {unit}'
-
-
 COMMANDS = (
     Command('run', 'run SLAM over a recording', _add_run_arguments, run),
-    Command('evaluate', 'score a run and draw its report', _add_evaluate_arguments, evaluate),
-    Command('convert', 'write a recording as a rosbag2', _add_convert_arguments, convert),
+    evaluate.COMMAND,
+    convert.COMMAND,
+    compare.COMMAND,
+    render.COMMAND,
+    refine.COMMAND,
+    export.COMMAND,
+    bench.COMMAND,
 )
 
 

@@ -166,6 +166,9 @@ class MappingConfig:
     mode: str = _setting('sync', 'Map inside each frame.', choices=('sync',))
     enabled: bool = _setting(True, 'Add to the map and refine it; off = only find the camera in a map that was loaded.')
     every: int = _setting(1, 'Densify and refine on every n-th frame.', 'frames', 1)
+    hold_out: int = _setting(
+        0, 'Keep every n-th frame out of the map, to score it on; its pose is found all the same. 0 = none.', 'frames', 0
+    )
     iterations: int = _setting(60, 'Optimisation steps per mapped frame.', '', 0)
     first_iterations: int = _setting(0, 'More steps on the first frame.', '', 0)
     optimizer: str = _setting(
@@ -189,6 +192,14 @@ class MappingConfig:
         0.0, 'Of fused fitting: prune only once this share of the map is to go; the map is copied then.', '', 0.0, 1.0
     )
     scene_radius_ratio: float = _setting(3.0, 'Scene radius = deepest reading of the first frame / this.', '', 0.1)
+
+    def is_held_out(self, index: int) -> bool:
+        """Whether a frame, counted from 0, is kept out of the map: frames n - 1, 2n - 1, ..."""
+        return self.hold_out > 0 and (index + 1) % self.hold_out == 0
+
+    def num_held_out(self, frames: int) -> int:
+        """How many of the first so many frames are kept out of the map."""
+        return frames // self.hold_out if self.hold_out else 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,6 +263,8 @@ def with_values(config: SlamConfig, values: Mapping[str, object]) -> SlamConfig:
         config = _replace_leaf(config, name.split('.'), known[name].check(value))
     if not config.depth.min_m < config.depth.max_m:
         raise ConfigError(f'depth.min_m = {config.depth.min_m:g}: expected less than depth.max_m = {config.depth.max_m:g}')
+    if config.mapping.hold_out == 1:
+        raise ConfigError('mapping.hold_out = 1: would leave no frame for the map; expected 0 (none) or at least 2')
     return config
 
 

@@ -31,3 +31,7 @@ class MapFileError(SplatamError):
 
 class RasterizerError(SplatamError):
     """A rasterizer backend that is missing, or was given what it cannot render."""
+
+
+class ExportError(SplatamError):
+    """A map that cannot be brought into the form asked for."""

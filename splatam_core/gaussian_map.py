@@ -98,6 +98,12 @@ class GaussianMap:
         groups = [{'params': [getattr(self, name).requires_grad_()], 'lr': getattr(rates, name)} for name in PARAMETERS]
         self._optimizer = torch.optim.Adam(groups, betas=(BETA_1, BETA_2), eps=EPSILON, fused=True)
 
+    def set_rates(self, rates: Rates) -> None:
+        """Go on with other step sizes."""
+        assert self._optimizer is not None
+        for group, name in zip(self._optimizer.param_groups, PARAMETERS):
+            group['lr'] = getattr(rates, name)
+
     def step(self) -> None:
         """Move along the gradients collected since the last step."""
         assert self._optimizer is not None

@@ -64,11 +64,17 @@ def ssim_map(a: Tensor, b: Tensor) -> Tensor:
     Returns:
         [3, H, W], at most 1.
     """
+    luminance, structure = ssim_terms(a, b)
+    return luminance * structure
+
+
+def ssim_terms(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """The two factors of ``ssim_map``: luminance, and contrast times structure."""
     c1, c2 = 0.01**2, 0.03**2
     mean_a, mean_b, aa, bb, ab = map(_Blur.apply, (a, b, a * a, b * b, a * b))
     variances = aa - mean_a**2 + bb - mean_b**2
     covariance = ab - mean_a * mean_b
-    return ((2 * mean_a * mean_b + c1) * (2 * covariance + c2)) / ((mean_a**2 + mean_b**2 + c1) * (variances + c2))
+    return (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1), (2 * covariance + c2) / (variances + c2)
 
 
 class _Blur(torch.autograd.Function):

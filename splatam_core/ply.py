@@ -25,6 +25,7 @@ SH_C0 = 0.28209479177387814
 
 NORMALS = ('nx', 'ny', 'nz')
 SCALES = ('scale_0', 'scale_1', 'scale_2')
+RGB = ('red', 'green', 'blue')
 ROTATION = ('rot_0', 'rot_1', 'rot_2', 'rot_3')
 NEEDED = ('x', 'y', 'z', 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', *SCALES)
 PROPERTIES = ('x', 'y', 'z', *NORMALS, 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', *SCALES, *ROTATION)
@@ -67,6 +68,36 @@ def _columns(gaussians: Gaussians) -> dict[str, NDArray[np.float64]]:
     columns |= {f'f_dc_{c}': (rgb[:, c] - 0.5) / SH_C0 for c in range(3)}
     columns |= {'opacity': logits, 'rot_0': np.ones(len(means))}
     return columns | dict.fromkeys(SCALES, log_scales[:, 0])
+
+
+def write_surface(
+    path: Path, points_m: NDArray[np.floating], rgb: NDArray[np.floating], triangles: NDArray[np.integer] | None = None
+) -> None:
+    """Write coloured points, or a mesh; a file that is there is replaced once the new one is complete.
+
+    Args:
+        path: the file.
+        points_m: [N, 3].
+        rgb: [N, 3], clamped to [0, 1] here.
+        triangles: [M, 3] indices of points; None = points only.
+    """
+    vertices = np.zeros(len(points_m), dtype=[*((name, '<f4') for name in 'xyz'), *((name, 'u1') for name in RGB)])
+    for axis, name in enumerate('xyz'):
+        vertices[name] = points_m[:, axis]
+    for channel, name in enumerate(RGB):
+        vertices[name] = np.rint(np.clip(rgb[:, channel], 0, 1) * 255)
+    header = [
+        'ply', 'format binary_little_endian 1.0', *(f'comment {line}' for line in COMMENTS[:2]),
+        f'element vertex {len(vertices)}', *(f'property float {name}' for name in 'xyz'),
+        *(f'property uchar {name}' for name in RGB),
+    ]  # fmt: skip
+    faces = np.zeros(0 if triangles is None else len(triangles), dtype=[('count', 'u1'), ('corners', '<i4', 3)])
+    if triangles is not None:
+        faces['count'], faces['corners'] = 3, triangles
+        header += [f'element face {len(faces)}', 'property list uchar int vertex_indices']
+    with replaced(path) as temporary, temporary.open('wb') as file:
+        file.write('\n'.join([*header, 'end_header', '']).encode('ascii'))
+        file.write(vertices.tobytes() + faces.tobytes())
 
 
 def read_ply(path: Path) -> Gaussians:

@@ -8,7 +8,8 @@
     metrics.json     the numbers; null until evaluated
     config.yaml      every setting
     run.json         source, camera, commit, machine, versions
-    report.png       drawn by the evaluation
+    report.png       drawn by the evaluation: one picture
+    report.html      drawn by the evaluation: one page that needs nothing else
     previous/        the same of before the map was last reset
 """
 
@@ -18,20 +19,24 @@ import csv
 import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TextIO
 
+import numpy as np
+from numpy.typing import NDArray
+
 from splatam_core import environment
 from splatam_core.camera import PinholeCamera
 from splatam_core.config import SlamConfig, load_config, to_yaml
 from splatam_core.errors import RunFolderError, SplatamError
 from splatam_core.evaluation.metrics import STAGES, Metrics, stage_statistics
-from splatam_core.files import is_unfinished, replace_text
-from splatam_core.ply import write_ply
+from splatam_core.files import is_unfinished, new_folder, replace_text
+from splatam_core.ply import read_ply, write_ply
+from splatam_core.rasterizer import Gaussians
 from splatam_core.trajectory import pose_line, read_trajectory, stamp_from_text, stamp_text
 from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status, Trajectory
 
@@ -45,7 +50,8 @@ METRICS = 'metrics.json'
 CONFIG = 'config.yaml'
 RUN = 'run.json'
 REPORT = 'report.png'
-FILES = (TRAJECTORY, FRAMES, MAP, METRICS, CONFIG, RUN, REPORT)
+PAGE = 'report.html'
+FILES = (TRAJECTORY, FRAMES, MAP, METRICS, CONFIG, RUN, REPORT, PAGE)
 CHECKPOINTS = 'checkpoints'
 PREVIOUS = 'previous'
 LOST = '# lost '
@@ -295,6 +301,8 @@ class RunRecord:
         description: what it is of.
         camera: of its frames; None when there was no frame.
         commit: of the code; None where unknown.
+        machine: what it ran on, by name.
+        versions: of the libraries, by name; None = not installed.
         trajectory: the tracked frames.
         lost_ns: stamps of the lost ones.
         frames: one record a frame; empty where there is no ``frames.csv``.
@@ -305,9 +313,46 @@ class RunRecord:
     description: RunDescription
     camera: PinholeCamera | None
     commit: str | None
+    machine: Mapping[str, str | int]
+    versions: Mapping[str, str | None]
     trajectory: Trajectory
     lost_ns: tuple[int, ...]
     frames: tuple[FrameRecord, ...]
+
+    def stamps_ns(self) -> list[int]:
+        """Stamps of all frames in order, the lost ones among them: the n-th is frame n of the run."""
+        return sorted([*map(int, self.trajectory.stamps_ns), *self.lost_ns])
+
+    def poses(self) -> dict[int, NDArray[np.float64]]:
+        """T_world_cam of the tracked frames, by stamp."""
+        return dict(zip(map(int, self.trajectory.stamps_ns), self.trajectory.T_world_cam))
+
+    def mapped_poses(self) -> dict[int, NDArray[np.float64]]:
+        """Those of the frames that were not held out of the map."""
+        is_held_out = self.config.mapping.is_held_out
+        held_out = {stamp_ns for index, stamp_ns in enumerate(self.stamps_ns()) if is_held_out(index)}
+        return {stamp_ns: pose for stamp_ns, pose in self.poses().items() if stamp_ns not in held_out}
+
+    def read_map(self) -> Gaussians:
+        """The map.
+
+        Raises:
+            RunFolderError: there is none.
+            MapFileError: it cannot be read.
+        """
+        if not (self.path / MAP).is_file():
+            raise RunFolderError(f'{self.path} has no {MAP}: the run ended before it could be saved')
+        return read_ply(self.path / MAP)
+
+    def camera_or_error(self) -> PinholeCamera:
+        """The camera of the frames.
+
+        Raises:
+            RunFolderError: there was no frame.
+        """
+        if self.camera is None:
+            raise RunFolderError(f'{self.path} has no camera: not one frame was processed')
+        return self.camera
 
     def metrics(self) -> Metrics:
         """The numbers the run wrote, or, when it was killed before it could, what its frames say.
@@ -322,6 +367,38 @@ class RunRecord:
             return Metrics.from_json(path.read_text())
         except RunFolderError as error:
             raise RunFolderError(f'{self.path}: {error}') from None
+
+
+def write_refined(run: RunRecord, path: Path, gaussians: Gaussians, iterations: int) -> None:
+    """Write a run's folder anew with another map; scores of images are gone, the rest is as it was.
+
+    Args:
+        run: the run the map was made from.
+        path: the new folder.
+        gaussians: the new map.
+        iterations: how many steps were taken from the old one.
+
+    Raises:
+        RunFolderError: something is at the path, or it cannot be written.
+    """
+    information = json.loads((run.path / RUN).read_text())
+    information |= {
+        'program': 'splatam refine', 'refined_from': str(run.path.resolve()), 'refined_iterations': iterations,
+        'started': _now(), 'commit': environment.commit(), 'machine': environment.machine(),
+        'versions': environment.versions(),
+    }  # fmt: skip
+    check_is_free(path)
+    try:
+        with new_folder(path) as folder:
+            for name in (TRAJECTORY, FRAMES, CONFIG):
+                if (run.path / name).exists():
+                    shutil.copy2(run.path / name, folder)
+            replace_text(folder / RUN, _to_json(information))
+            write_ply(folder / MAP, gaussians)
+            metrics = run_metrics(run.frames, len(gaussians), environment.peak_rss_mb())
+            replace_text(folder / METRICS, metrics.to_json())
+    except OSError as error:
+        raise RunFolderError(f'{path}: cannot be written: {error.strerror}; choose another folder') from None
 
 
 def read_run(path: Path) -> RunRecord:
@@ -344,6 +421,8 @@ def read_run(path: Path) -> RunRecord:
             description=description,
             camera=None if camera is None else PinholeCamera(**camera),
             commit=information['commit'],
+            machine=information['machine'],
+            versions=information['versions'],
             trajectory=read_trajectory(path / TRAJECTORY),
             lost_ns=_read_lost(path / TRAJECTORY),
             frames=_read_frames(path / FRAMES),

@@ -112,9 +112,7 @@ class Slam:
             raise SplatamError('nothing can be rendered before the first frame: the camera is not known')
         T_cam_world = torch.from_numpy(se3.inverse(T_world_cam)).float()
         with torch.no_grad():
-            render = self._rasterizer.render(self.map.gaussians.detached(), self.camera, T_cam_world)
-        rgb = render.rgb.clamp(0, 1).mul(255).round().byte().permute(1, 2, 0).contiguous()
-        return RenderedView(rgb.numpy(), render.depth().numpy(), render.silhouette.numpy())
+            return self._rasterizer.render(self.map.gaussians.detached(), self.camera, T_cam_world).images()
 
     def snapshot(self) -> MapSnapshot:
         """A copy of the map."""
@@ -131,19 +129,26 @@ class Slam:
         self.camera = frame.camera
 
     def _initialize(self, index: int, frame: RgbdFrame, view: View, clock: _Stopwatch) -> FrameResult:
-        if not (view.valid.any() and self.config.mapping.enabled):
-            reason = 'no pixel has a usable depth reading' if self.config.mapping.enabled else 'mapping.enabled is off'
+        if reason := self._why_not_to_start(index, view):
             reason = f'the map cannot start: {reason}'
             return self._result(index, frame, Status.LOST, None, False, clock, reason, 0.0, 0.0)
         self._motion.observe(frame.stamp_ns, np.eye(4))
         self._map(0, _posed(view, np.eye(4)), 0.0, clock)
         return self._result(index, frame, Status.INITIALIZED, np.eye(4), True, clock, '', 1.0, 1.0)
 
+    def _why_not_to_start(self, index: int, view: View) -> str:
+        if not self.config.mapping.enabled:
+            return 'mapping.enabled is off'
+        if self.config.mapping.is_held_out(index):
+            return 'this frame is held out of it (mapping.hold_out)'
+        return '' if view.valid.any() else 'no pixel has a usable depth reading'
+
     def _map(self, index: int, current: PosedView, sure_fraction: float, clock: _Stopwatch) -> bool:
         """Densify, choose a window, refine; keep the view if it is due. Whether it was."""
         config = self.config
-        if not config.mapping.enabled:
+        if not config.mapping.enabled or config.mapping.is_held_out(index):
             return False
+        index -= config.mapping.num_held_out(index)  # what is held out leaves the rhythm of the others as it is
         self._scene_radius = self._scene_radius or float(current.view.depth.max()) / config.mapping.scene_radius_ratio
         mapped, every = divmod(index, config.mapping.every)
         if every == 0:

@@ -198,7 +198,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal.signal(number, stop)
     try:
         demo(args.source, args.out)
-        print(f'look at    {args.out}/report.png, and map.ply, trajectory.txt, metrics.json beside it')
+        print(f'look at    {args.out}/report.html, and report.png, map.ply, trajectory.txt, metrics.json beside it')
     except DemoError as error:
         print(f'demo: {error}', file=sys.stderr)
         return 1

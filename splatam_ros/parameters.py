@@ -159,6 +159,7 @@ FIXED = {
     'slam.rasterizer': 'it is made when the node starts',
     'slam.tracking.motion_model': 'it is made when the map starts',
     'slam.mapping.mode': 'the threads are running',
+    'slam.mapping.hold_out': 'frames are told apart by it when the run is scored',
     'slam.mapping.scene_radius_ratio': 'it is read when the map starts',
 }
 

@@ -60,8 +60,8 @@ def test_the_whole_way(out: Path) -> None:
     metrics = json.loads((out / 'metrics.json').read_text())
     assert metrics['tracked'] == metrics['frames'] == 4
     assert metrics['ate_rmse_m'] < 0.005  # measured 0.2 cm; poses that all stood still would be off by 0.9 cm
-    assert {'report.png', 'map.ply', 'trajectory.txt'} <= {path.name for path in out.iterdir()}
-    assert f'{out}/report.png' in said
+    assert {'report.html', 'report.png', 'map.ply', 'trajectory.txt'} <= {path.name for path in out.iterdir()}
+    assert f'{out}/report.html' in said
     assert not alive(out)
     require_replaceable(out)  # by the next run
 

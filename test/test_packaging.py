@@ -71,6 +71,7 @@ def test_every_python_file_is_packaged(tmp_path: Path) -> None:
     for package in (NAME, 'splatam_core', 'msg_adapters'):
         written = {path for path in files_below(ROOT / package, '*.py') if path.parts[0] != 'launch'}
         assert files_below(tmp_path / package, '*.py') == written
+        assert files_below(tmp_path / package, '*.html') == files_below(ROOT / package, '*.html')
 
 
 @pytest.fixture

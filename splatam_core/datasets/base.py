@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core.camera import PinholeCamera
-from splatam_core.errors import DatasetError
+from splatam_core.errors import DatasetError, FrameError
 from splatam_core.types import RgbdFrame, Trajectory
 
 FIRST_STAMP_NS = 1_000_000_000
@@ -172,6 +172,14 @@ class Window:
     def ground_truth(self) -> Trajectory | None:
         """The truth of the whole recording."""
         return self._sequence.ground_truth()
+
+
+def frame_or_none(sequence: Sequence, index: int) -> RgbdFrame | None:
+    """A frame, or None where its images do not fit the camera: SLAM did not take it either."""
+    try:
+        return sequence[index]
+    except FrameError:
+        return None
 
 
 def cut(sequence: Sequence, options: ReadOptions) -> Sequence:

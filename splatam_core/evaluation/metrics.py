@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
 
 import numpy as np
 
 from splatam_core.errors import RunFolderError
+from splatam_core.evaluation.images import ImageScores, OriginalScores
 from splatam_core.types import StageTimings
 
 STAGES = tuple(entry.name for entry in fields(StageTimings))
@@ -24,7 +26,7 @@ class StageStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Metrics:
-    """What a run is judged by.
+    """What a run is judged by; docs/evaluation.md defines each number.
 
     Attributes:
         frames: frames processed.
@@ -37,12 +39,32 @@ class Metrics:
         timings_ms: wall time of each stage over the frames.
         ate_rmse_m: root mean squared distance of the camera centres to the truth, all tracked frames, SE(3)-aligned.
         ate_frames: tracked frames that have a truth and thus enter ``ate_rmse_m``.
+        splatam_ate_mean_m: what the original prints as "ATE RMSE".
+        rpe_trans_frame_m: relative pose error from frame to frame, RMSE of the translation.
+        rpe_rot_frame_deg: of the rotation.
+        rpe_frame_pairs: pairs of frames that entered.
+        rpe_trans_1s_m: the same over one second.
+        rpe_rot_1s_deg: of the rotation.
+        rpe_1s_pairs: pairs of frames that entered.
         psnr_db: final map rendered at the estimated poses, over the pixels with a depth reading, mean over frames.
         ssim: likewise.
         depth_l1_m: likewise, of the expected depth.
         psnr_full_db: over whole images, holes included.
-        evaluated_every: every n-th frame entered the four above; None before they are evaluated.
-        evaluated_frames: frames that entered the four above.
+        depth_rmse_m: of the expected depth, over the pixels with a reading.
+        ms_ssim: of whole images.
+        lpips: of whole images.
+        evaluated_every: every n-th frame entered the seven above; None before they are evaluated.
+        evaluated_frames: frames that entered them.
+        splatam: the same frames, scored as the original does.
+        heldout_frames: frames kept out of the map that entered ``heldout``; None where there are none.
+        heldout: the scores of those, at their estimated poses.
+        novel_alignment: how the truth of a test split was brought into the map: ``trajectory`` or ``first``.
+        novel_frames: its views without holes, which entered ``novel``.
+        novel: their scores, at their true poses.
+        novel_holes_frames: its views with holes.
+        novel_holes: their scores.
+        splatam_novel: the views without holes, scored as the original does.
+        notes: why a number is null, by its name, where that needs saying.
     """
 
     frames: int
@@ -55,16 +77,50 @@ class Metrics:
     timings_ms: Mapping[str, StageStatistics]
     ate_rmse_m: float | None = None
     ate_frames: int | None = None
+    splatam_ate_mean_m: float | None = None
+    rpe_trans_frame_m: float | None = None
+    rpe_rot_frame_deg: float | None = None
+    rpe_frame_pairs: int | None = None
+    rpe_trans_1s_m: float | None = None
+    rpe_rot_1s_deg: float | None = None
+    rpe_1s_pairs: int | None = None
     psnr_db: float | None = None
     ssim: float | None = None
     depth_l1_m: float | None = None
     psnr_full_db: float | None = None
+    depth_rmse_m: float | None = None
+    ms_ssim: float | None = None
+    lpips: float | None = None
     evaluated_every: int | None = None
     evaluated_frames: int | None = None
+    splatam: OriginalScores = OriginalScores()
+    heldout_frames: int | None = None
+    heldout: ImageScores = ImageScores()
+    novel_alignment: str | None = None
+    novel_frames: int | None = None
+    novel: ImageScores = ImageScores()
+    novel_holes_frames: int | None = None
+    novel_holes: ImageScores = ImageScores()
+    splatam_novel: OriginalScores = OriginalScores()
+    notes: Mapping[str, str] = field(default_factory=dict)
+
+    def values(self) -> dict[str, Any]:
+        """Every number by its name in ``metrics.json``: a group's scores carry its name in front."""
+        flat: dict[str, Any] = {}
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if entry.name in GROUPS:
+                flat |= {f'{entry.name}_{name}': score for name, score in asdict(value).items()}
+            else:
+                flat[entry.name] = value
+        return flat
 
     def to_json(self) -> str:
         """As the text of ``metrics.json``."""
-        return json.dumps(asdict(self), indent=2, allow_nan=False) + '\n'
+        values = self.values()
+        values['timings_ms'] = {name: asdict(stage) for name, stage in self.timings_ms.items()}
+        values['notes'] = dict(self.notes)
+        return json.dumps(values, indent=2, allow_nan=False) + '\n'
 
     @classmethod
     def from_json(cls, text: str) -> Metrics:
@@ -76,10 +132,23 @@ class Metrics:
         try:
             values = json.loads(text)
             known = {entry.name: values[entry.name] for entry in fields(cls) if entry.name in values}
+            known |= {name: _group(name, kind, values) for name, kind in GROUPS.items()}
             known['timings_ms'] = {name: StageStatistics(**stage) for name, stage in known['timings_ms'].items()}
             return cls(**known)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise RunFolderError(f'metrics.json cannot be read: {error}; delete it and evaluate again') from None
+
+
+GROUPS = {
+    'splatam': OriginalScores, 'heldout': ImageScores, 'novel': ImageScores, 'novel_holes': ImageScores,
+    'splatam_novel': OriginalScores,
+}  # fmt: skip
+
+
+def _group(
+    name: str, kind: type[ImageScores | OriginalScores], values: Mapping[str, Any]
+) -> ImageScores | OriginalScores:
+    return kind(**{entry.name: values.get(f'{name}_{entry.name}') for entry in fields(kind)})
 
 
 def stage_statistics(timings: Sequence[StageTimings]) -> dict[str, StageStatistics]:

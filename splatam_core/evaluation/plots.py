@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
@@ -34,27 +36,52 @@ def seconds(evaluation: Evaluation, stamps_ns: NDArray[np.int64]) -> NDArray[np.
     return (np.asarray(stamps_ns, dtype=np.int64) - first) * 1e-9
 
 
-def top_view(ax: Axes, evaluation: Evaluation) -> LineCollection | None:
-    """The path from above: x right, z forward. Returns the error-coloured line where a truth is known."""
+@dataclass(frozen=True, slots=True)
+class Projection:
+    """A way to look at a path.
+
+    Attributes:
+        title: what it is called.
+        axes: which coordinates go right and up.
+        labels: theirs.
+        flip: whether the upward coordinate grows downwards.
+    """
+
+    title: str
+    axes: tuple[int, int]
+    labels: tuple[str, str]
+    flip: bool = False
+
+
+ABOVE = Projection('Path from above', (0, 2), ('x, right (m)', 'z, forward (m)'))
+SIDE = Projection('Path from the side', (2, 1), ('z, forward (m)', 'y, down (m)'), flip=True)
+
+
+def path_view(ax: Axes, evaluation: Evaluation, projection: Projection = ABOVE) -> LineCollection | None:
+    """The path from one side. Returns the error-coloured line where a truth is known."""
+    seen = list(projection.axes)
     centres = evaluation.run.trajectory.T_world_cam[:, :3, 3]
     colored = None
     if evaluation.truth is not None:
-        _line(ax, _truth_in_span(evaluation, evaluation.truth)[1][:, [0, 2]], TRUTH, 1.6, 'truth')
-        colored = _error_line(ax, evaluation, evaluation.truth.error)
+        _line(ax, _truth_in_span(evaluation, evaluation.truth)[1][:, seen], TRUTH, 1.6, 'truth')
+        colored = _error_line(ax, evaluation, evaluation.truth.error, seen)
     else:
-        _line(ax, centres[:, [0, 2]], ESTIMATE, 1.8, 'estimate')
+        _line(ax, centres[:, seen], ESTIMATE, 1.8, 'estimate')
     if len(centres):
-        ax.plot(*centres[0, [0, 2]], 'o', ms=7, mfc='white', mec=INK, mew=1.4, label='start', zorder=4)
-        ax.plot(*centres[-1, [0, 2]], 's', ms=6, color=INK, label='end', zorder=4)
+        ax.plot(*centres[0, seen], 'o', ms=7, mfc='white', mec=INK, mew=1.4, label='start', zorder=4)
+        ax.plot(*centres[-1, seen], 's', ms=6, color=INK, label='end', zorder=4)
         ax.legend(loc='best')
-    ax.set(title='Path from above', xlabel='x, right (m)', ylabel='z, forward (m)')
+    ax.set(title=projection.title, xlabel=projection.labels[0], ylabel=projection.labels[1])
     ax.set_aspect('equal', adjustable='datalim')
     ax.margins(0.08)
+    ax.xaxis.set_major_locator(MaxNLocator(5))
+    if projection.flip:
+        ax.invert_yaxis()
     return colored
 
 
-def _error_line(ax: Axes, evaluation: Evaluation, error: TrajectoryError) -> LineCollection:
-    points = error.estimate_m[:, [0, 2]]
+def _error_line(ax: Axes, evaluation: Evaluation, error: TrajectoryError, seen: list[int]) -> LineCollection:
+    points = error.estimate_m[:, seen]
     connected = _connected(evaluation, error.stamps_ns)
     pieces = np.stack([points[:-1], points[1:]], axis=1)[connected]  # [K, 2, 2]
     values_cm = (error.errors_m[:-1] + error.errors_m[1:])[connected] * 50
@@ -73,7 +100,7 @@ def coordinates_over_time(axes: NDArray[np.object_], evaluation: Evaluation) -> 
             truth_s, truth_m = _truth_in_span(evaluation, evaluation.truth)
             ax.plot(truth_s, truth_m[:, axis], color=TRUTH, lw=3, label='truth')
         curve = _broken(evaluation, run.trajectory.stamps_ns, stamps_s, centres[:, axis])
-        ax.plot(*curve, color=ESTIMATE, lw=1.3, label='estimate')
+        ax.plot(*curve, color=ESTIMATE, lw=1.3, label='estimate', marker='.' if len(centres) == 1 else None)
         _mark_lost(ax, evaluation)
         ax.set_ylabel(name)
         ax.yaxis.set_major_locator(MaxNLocator(4))
@@ -127,9 +154,10 @@ def stage_times(ax: Axes, evaluation: Evaluation) -> None:
     stages = [stage for stage in STAGES if stage in STAGE_COLORS]
     times_ms = np.array([[getattr(record.timings, stage) for record in records] for stage in stages])
     medians = np.median(times_ms, axis=1)
+    edges, until_last = np.arange(len(records) + 1) - 0.5, np.concatenate([times_ms, times_ms[:, -1:]], axis=1)
     ax.stackplot(
-        np.arange(len(records)), times_ms, colors=[STAGE_COLORS[stage] for stage in stages], lw=0, alpha=0.85,
-        labels=[f'{stage}  {median:.0f} ms' for stage, median in zip(stages, medians)], step='mid',
+        edges, until_last, colors=[STAGE_COLORS[stage] for stage in stages], lw=0, alpha=0.85,
+        labels=[f'{stage}  {median:.0f} ms' for stage, median in zip(stages, medians)], step='post',
     )  # fmt: skip
     ax.set_xlim(-0.5, len(records) - 0.5)
     ax.set_ylim(0, max(1e-3, float(np.percentile(times_ms.sum(axis=0), 99)) * 1.35))
@@ -158,24 +186,50 @@ def map_size(ax: Axes, evaluation: Evaluation) -> None:
     ax.legend(loc='lower right')
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Panels:
+    """The pictures of one sample, and how their values become colours.
+
+    Attributes:
+        reading_m: [H, W] depth, NaN = none.
+        rendered_m: [H, W] rendered depth, NaN = none.
+        rgb_difference: [H, W] mean absolute difference of colour.
+        depth_difference_cm: [H, W], NaN = no reading.
+        depth_norm: of both depths.
+        depth_difference_norm: of their difference.
+    """
+
+    reading_m: FloatImage
+    rendered_m: FloatImage
+    rgb_difference: FloatImage
+    depth_difference_cm: FloatImage
+    depth_norm: Normalize
+    depth_difference_norm: Normalize
+
+    @classmethod
+    def of(cls, sample: Sample) -> Panels:
+        """Of a sample."""
+        reading = np.where(sample.reading_m > 0, sample.reading_m, np.nan)
+        rendered = np.where(sample.depth_m > 0, sample.depth_m, np.nan)
+        difference_cm = np.abs(sample.depth_m - reading) * 100
+        rgb_difference = np.abs(sample.rgb - sample.frame.rgb / 255).mean(axis=2)
+        limits = _depth_norm(reading, rendered), Normalize(0, _difference_limit_cm(difference_cm))
+        return cls(reading, rendered, rgb_difference, difference_cm, *limits)
+
+
 def sample_images(axes: NDArray[np.object_], sample: Sample) -> tuple[AxesImage, AxesImage, AxesImage]:
     """One frame: colour, its render, their difference; depth, its render, their difference.
 
     Returns:
         The images that a colour bar explains: colour difference, depth, depth difference.
     """
-    frame = sample.frame
-    reading = np.where(sample.reading_m > 0, sample.reading_m, np.nan)
-    rendered = np.where(sample.depth_m > 0, sample.depth_m, np.nan)
-    difference_cm = np.abs(sample.depth_m - reading) * 100
-    rgb_difference = np.abs(sample.rgb - frame.rgb / 255).mean(axis=2)
-    depth_norm, difference_norm = _depth_norm(reading, rendered), Normalize(0, _difference_limit_cm(difference_cm))
-    axes[0].imshow(frame.rgb)
+    panels = Panels.of(sample)
+    axes[0].imshow(sample.frame.rgb)
     axes[1].imshow(sample.rgb)
-    color = axes[2].imshow(rgb_difference, cmap=DIFFERENCE_COLORS, norm=Normalize(0, COLOR_DIFFERENCE_LIMIT))
-    axes[3].imshow(reading, cmap=DEPTH_COLORS, norm=depth_norm)
-    depth = axes[4].imshow(rendered, cmap=DEPTH_COLORS, norm=depth_norm)
-    difference = axes[5].imshow(difference_cm, cmap=DIFFERENCE_COLORS, norm=difference_norm)
+    color = axes[2].imshow(panels.rgb_difference, cmap=DIFFERENCE_COLORS, norm=Normalize(0, COLOR_DIFFERENCE_LIMIT))
+    axes[3].imshow(panels.reading_m, cmap=DEPTH_COLORS, norm=panels.depth_norm)
+    depth = axes[4].imshow(panels.rendered_m, cmap=DEPTH_COLORS, norm=panels.depth_norm)
+    difference = axes[5].imshow(panels.depth_difference_cm, cmap=DIFFERENCE_COLORS, norm=panels.depth_difference_norm)
     for ax in axes:
         ax.set(xticks=[], yticks=[])
         ax.spines[:].set_visible(False)

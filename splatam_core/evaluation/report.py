@@ -69,8 +69,8 @@ def draw_report(evaluation: Evaluation) -> Figure:
 
 def _draw_header(figure: SubFigure, evaluation: Evaluation) -> None:
     figure.text(0.012, 0.86, _plain(evaluation.run.path.resolve().name), fontsize=20, fontweight='bold', va='center')
-    figure.text(0.012, 0.64, _plain(_subtitle(evaluation)), fontsize=10, color=plots.MUTED, va='center')
-    tiles = _tiles(evaluation)
+    figure.text(0.012, 0.64, _plain(subtitle(evaluation)), fontsize=10, color=plots.MUTED, va='center')
+    tiles = headline(evaluation)
     for index, (value, unit, name) in enumerate(tiles):
         x = 0.012 + index * (0.98 / len(tiles))
         number = figure.text(x, 0.28, value, fontsize=19, fontweight='bold', va='baseline')
@@ -84,7 +84,8 @@ def _text_after(figure: SubFigure, text: matplotlib.text.Text, following: str) -
     figure.text(box.x1, text.get_position()[1], following, fontsize=10, color=plots.MUTED, va='baseline')
 
 
-def _subtitle(evaluation: Evaluation) -> str:
+def subtitle(evaluation: Evaluation) -> str:
+    """What was run, on one line."""
     run = evaluation.run
     source = run.description.source
     parts = [
@@ -103,10 +104,10 @@ def _plain(text: str) -> str:
     return text.replace('$', r'\$')
 
 
-def _tiles(evaluation: Evaluation) -> list[tuple[str, str, str]]:
-    """(value, unit, name) of the headline numbers; an en dash where one is not known."""
+def headline(evaluation: Evaluation) -> list[tuple[str, str, str]]:
+    """The numbers to see first: (value, unit, name) of the headline numbers; an en dash where one is not known."""
     m = evaluation.metrics
-    every = f', every {m.evaluated_every}th frame' if m.evaluated_every and m.evaluated_every > 1 else ''
+    every = f', 1 in {m.evaluated_every} frames' if m.evaluated_every and m.evaluated_every > 1 else ''
     return [
         (_digits(m.ate_rmse_m, 100, 2), 'cm', 'ATE RMSE'),
         (_digits(m.psnr_db, 1, 2), 'dB', f'PSNR{every}'),
@@ -126,7 +127,7 @@ def _digits(value: float | None, factor: float, decimals: int) -> str:
 def _draw_paths(figure: SubFigure, evaluation: Evaluation) -> None:
     grid = figure.add_gridspec(3, 3, width_ratios=[1.05, 1.2, 1.0])
     above = figure.add_subplot(grid[:, 0])
-    line = plots.top_view(above, evaluation)
+    line = plots.path_view(above, evaluation)
     if line is not None:
         bar = figure.colorbar(line, ax=above, fraction=0.035, pad=0.02, label='estimate: distance to the truth (cm)')
         bar.outline.set_visible(False)

@@ -1,26 +1,36 @@
-"""How far an estimated trajectory is from the truth: the absolute trajectory error (ATE).
+"""How far an estimated trajectory is from the truth: absolute (ATE) and relative (RPE) pose errors.
 
-Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012, section IV-B. Two points are
+Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012, section IV. Two points are
 settled here: the truth is interpolated at the frame's stamp rather than taken from the nearest sample, and the
-alignment is rigid: a depth camera knows its scale.
+alignment is rigid: a depth camera knows its scale. What SplaTAM's own evaluation prints in place of the ATE is
+``splatam_ate_mean_m``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from splatam_core import se3
 from splatam_core.errors import RunFolderError
 from splatam_core.trajectory import stamp_text
 from splatam_core.types import Trajectory
+
+Indices = NDArray[np.intp]
 
 MAX_TRUTH_GAP_NS = 500_000_000
 """Between two truth poses further apart than this a position would be a guess: such frames are not scored."""
 
 STAMP_ROUNDING_NS = 1_000_000
 """A frame this close to a truth pose is at it, even outside the truth's span: files round their stamps."""
+
+ONE_SECOND_NS = 1_000_000_000
+
+INTERVAL_TOLERANCE_NS = 20_000_000
+"""Two frames this close to a second apart count as a second apart; at 30 Hz the nearest is within 17 ms."""
 
 MIN_POSES = 3
 """Two poses can always be laid onto each other: their error says nothing."""
@@ -64,8 +74,127 @@ def trajectory_error(estimate: Trajectory, truth: Trajectory) -> TrajectoryError
     T = align(true_m, estimate_m)
     truth_m = true_m @ T[:3, :3].T + T[:3, 3]
     errors_m = np.linalg.norm(estimate_m - truth_m, axis=1)
-    rmse_m = float(np.sqrt(np.mean(errors_m**2)))
-    return TrajectoryError(rmse_m, estimate.stamps_ns[known], estimate_m, truth_m, errors_m, T)
+    return TrajectoryError(_rms(errors_m), estimate.stamps_ns[known], estimate_m, truth_m, errors_m, T)
+
+
+@dataclass(frozen=True, slots=True)
+class RelativePoseError:
+    """How the motion between frames some time apart differs from the true motion.
+
+    Attributes:
+        translation_rmse_m: root of the mean squared translation of the difference; None where there is no pair.
+        rotation_rmse_deg: root of the mean squared angle of the difference.
+        pairs: how many pairs of frames entered.
+    """
+
+    translation_rmse_m: float | None
+    rotation_rmse_deg: float | None
+    pairs: int
+
+
+def relative_pose_errors(
+    estimate: Trajectory, truth: Trajectory, lost_ns: Collection[int] = ()
+) -> tuple[RelativePoseError, RelativePoseError]:
+    """The relative pose error from each frame to the next, and over one second.
+
+    Sturm et al., equation 2: ``(Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`` of true poses Q and estimated poses P. No alignment
+    enters. Frame j is the next one, unless a frame between the two was lost; or the one nearest to a second later,
+    unless that is more than 20 ms off.
+
+    Args:
+        estimate: online poses of the tracked frames.
+        truth: true poses, in any world frame.
+        lost_ns: stamps of the lost frames.
+    """
+    true_poses, known = interpolate_poses(truth, estimate.stamps_ns)
+    stamps_ns, poses, true_poses = estimate.stamps_ns[known], estimate.T_world_cam[known], true_poses[known]
+    gaps = np.array(sorted([*lost_ns, *map(int, estimate.stamps_ns[~known])]), dtype=np.int64)
+    pairs = _next_frames(stamps_ns, gaps), _a_second_later(stamps_ns)
+    per_frame, per_second = (_relative_pose_error(poses, true_poses, *pair) for pair in pairs)
+    return per_frame, per_second
+
+
+def _next_frames(stamps_ns: NDArray[np.int64], gaps_ns: NDArray[np.int64]) -> tuple[Indices, Indices]:
+    before = np.searchsorted(gaps_ns, stamps_ns)
+    first = np.flatnonzero(before[1:] == before[:-1])
+    return first, first + 1
+
+
+def _a_second_later(stamps_ns: NDArray[np.int64]) -> tuple[Indices, Indices]:
+    if len(stamps_ns) == 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    wanted = stamps_ns + ONE_SECOND_NS
+    after = np.searchsorted(stamps_ns, wanted)
+    candidates = np.clip(np.stack([after - 1, after]), 0, len(stamps_ns) - 1)  # [2, N]
+    distance = np.abs(stamps_ns[candidates] - wanted)
+    nearest = np.where(distance[0] <= distance[1], *candidates)
+    first = np.flatnonzero(distance.min(axis=0) <= INTERVAL_TOLERANCE_NS)
+    return first, nearest[first]
+
+
+def _relative_pose_error(
+    poses: NDArray[np.float64], true_poses: NDArray[np.float64], first: Indices, second: Indices
+) -> RelativePoseError:
+    if len(first) == 0:
+        return RelativePoseError(None, None, 0)
+    motion, true_motion = (se3.inverse(T[first]) @ T[second] for T in (poses, true_poses))
+    difference = se3.inverse(true_motion) @ motion  # [K, 4, 4]
+    angles = np.array([np.linalg.norm(se3.rotation_vector(R)) for R in difference[:, :3, :3]])
+    translations = np.linalg.norm(difference[:, :3, 3], axis=1)
+    return RelativePoseError(_rms(translations), float(np.degrees(_rms(angles))), len(first))
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def splatam_ate_mean_m(estimate: Trajectory, truth: Trajectory) -> float:
+    """What SplaTAM's evaluation prints as "ATE RMSE": neither of camera centres, nor a root mean square.
+
+    It takes the translation columns of the world-to-camera matrices, -R^T c, aligns those of the truth rigidly to
+    those of the estimate, and averages the distances. They depend on where the world has its origin: the truth is put
+    into the world of the first pose that has one.
+
+    Raises:
+        RunFolderError: fewer than three poses have a truth at their stamp.
+    """
+    true_poses, known = interpolate_poses(truth, estimate.stamps_ns)
+    if known.sum() < MIN_POSES:
+        raise RunFolderError(_too_few(estimate, truth, int(known.sum())))
+    poses, true_poses = estimate.T_world_cam[known], true_poses[known]
+    true_poses = poses[0] @ se3.inverse(true_poses[0]) @ true_poses
+    points, true_points = (se3.inverse(T)[:, :3, 3] for T in (poses, true_poses))
+    T = align(true_points, points)
+    return float(np.linalg.norm(points - (true_points @ T[:3, :3].T + T[:3, 3]), axis=1).mean())
+
+
+def interpolate_poses(truth: Trajectory, stamps_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """True poses at some stamps: centres linear in between, rotations at constant angular speed.
+
+    Args:
+        truth: N poses.
+        stamps_ns: [M] int64.
+
+    Returns:
+        T_world_cam [M, 4, 4], and [M] whether each is known: inside the truth's span and in no gap of it.
+    """
+    centres, known = interpolate_centres(truth, stamps_ns)
+    poses = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
+    for index in np.flatnonzero(known):
+        poses[index, :3, :3] = _interpolated_rotation(truth, int(stamps_ns[index]))
+        poses[index, :3, 3] = centres[index]
+    return poses, known
+
+
+def _interpolated_rotation(truth: Trajectory, stamp_ns: int) -> NDArray[np.float64]:
+    after = min(int(np.searchsorted(truth.stamps_ns, stamp_ns)), len(truth) - 1)
+    before = max(0, after - 1)
+    R_before, R_after = truth.T_world_cam[before, :3, :3], truth.T_world_cam[after, :3, :3]
+    interval_ns = int(truth.stamps_ns[after] - truth.stamps_ns[before])
+    share = float(np.clip((stamp_ns - int(truth.stamps_ns[before])) / interval_ns, 0, 1)) if interval_ns else 0.0
+    turn = np.zeros(6)
+    turn[3:] = share * se3.rotation_vector(R_before.T @ R_after)
+    return R_before @ se3.exp(turn)[:3, :3]
 
 
 def interpolate_centres(
@@ -107,12 +236,35 @@ def align(source: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[n
         T_target_source, [4, 4]. Where the points leave it open (all on one line, say), one of the best.
     """
     mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
-    covariance = (target - mean_target).T @ (source - mean_source)
-    U, _, V_t = np.linalg.svd(covariance)
-    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(V_t))])
+    R = _nearest_rotation((target - mean_target).T @ (source - mean_source))
+    return _motion(R, mean_target - R @ mean_source)
+
+
+def align_poses(source: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rigid motion that brings poses onto others: the mean of their rotations, then of their centres.
+
+    Unlike ``align`` it is well defined for any path, a straight one or one that turns on the spot too.
+
+    Args:
+        source: [N, 4, 4] camera to the source's world, N at least 1.
+        target: [N, 4, 4] the same cameras to the target's world.
+
+    Returns:
+        T_target_source, [4, 4].
+    """
+    R = _nearest_rotation((target[:, :3, :3] @ np.swapaxes(source[:, :3, :3], 1, 2)).sum(axis=0))
+    return _motion(R, (target[:, :3, 3] - source[:, :3, 3] @ R.T).mean(axis=0))
+
+
+def _nearest_rotation(M: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotation R that makes trace(R^T M) largest."""
+    U, _, V_t = np.linalg.svd(M)
+    return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(V_t))]) @ V_t
+
+
+def _motion(R: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
     T = np.eye(4)
-    T[:3, :3] = U @ mirror @ V_t
-    T[:3, 3] = mean_target - T[:3, :3] @ mean_source
+    T[:3, :3], T[:3, 3] = R, t
     return T
 
 

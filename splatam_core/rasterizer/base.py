@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from splatam_core.camera import PinholeCamera
+from splatam_core.types import RenderedView
 
 NEAR_M = 0.2
 BLUR_PX2 = 0.3
@@ -123,6 +124,11 @@ class Render:
         """[H, W] expected depth in metres; 0 where the silhouette is below the limit."""
         seen = self.silhouette >= min_silhouette
         return torch.where(seen, self.depth_acc / torch.where(seen, self.silhouette, 1.0), 0.0)
+
+    def images(self) -> RenderedView:
+        """The same for people and for metrics: 8-bit colour, expected depth, silhouette."""
+        rgb = self.rgb.clamp(0, 1).mul(255).round().byte().permute(1, 2, 0).contiguous()
+        return RenderedView(rgb.numpy(), self.depth().numpy(), self.silhouette.numpy())
 
 
 class Rasterizer(Protocol):

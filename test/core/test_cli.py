@@ -87,6 +87,7 @@ def of_the_node(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_run_writes_everything(finished: Path) -> None:
     names = {'trajectory.txt', 'frames.csv', 'map.ply', 'metrics.json', 'config.yaml', 'run.json', 'report.png'}
+    names |= {'report.html'}
     assert {entry.name for entry in finished.iterdir()} == names
     assert len((finished / 'trajectory.txt').read_text().splitlines()) == FRAMES
     run = read_run(finished)
@@ -103,7 +104,13 @@ def test_run_s_metrics_are_known_and_sane(finished: Path) -> None:
     assert 0 < m['fps_with_io'] < m['fps']
     assert m['ate_rmse_m'] < 0.05 and m['psnr_db'] > 15 and 0 < m['ssim'] < 1 and m['depth_l1_m'] < 0.2
     assert m['timings_ms'].keys() == {'track', 'densify', 'keyframes', 'map', 'total'}
-    assert all(m[name] is not None for name in m)
+    assert m['rpe_trans_frame_m'] < 0.05 and m['rpe_frame_pairs'] == FRAMES - 1 and m['depth_rmse_m'] > m['depth_l1_m']
+    # Nothing was held out, no test split rendered, four frames last no second, and 64 pixels are too few for MS-SSIM.
+    groups = 'heldout_', 'novel_', 'splatam_novel_'
+    null = {name for name in m if m[name] is None and not name.startswith(groups)}
+    assert null - {'lpips', 'splatam_lpips'} == {'rpe_trans_1s_m', 'rpe_rot_1s_deg', 'ms_ssim', 'splatam_ms_ssim'}
+    assert all(m[name] is None for name in m if name.startswith(groups))
+    assert '64x48' in m['notes']['ms_ssim']
 
 
 def test_run_says_how_it_went(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,8 +12,15 @@ from torch import Tensor
 from splatam_core import se3
 from splatam_core.camera import PinholeCamera
 from splatam_core.config import DepthConfig
-from splatam_core.evaluation.images import FrameScores, ImageScores, ViewScorer, mean_scores, score_view
-from splatam_core.rasterizer import Gaussians, make_rasterizer
+from splatam_core.evaluation.images import (
+    FrameScores,
+    ImageScores,
+    ViewScorer,
+    mean_scores,
+    original_scores,
+    score_view,
+)
+from splatam_core.rasterizer import Gaussians, Render, make_rasterizer
 from splatam_core.types import RgbdFrame
 
 ROUND_OFF_DB = 1e-4  # 32-bit colours around 0.5
@@ -34,7 +41,7 @@ def depth(metres: float) -> Tensor:
 def test_identical_is_perfect_and_finite() -> None:
     rgb = torch.rand(3, H, W, generator=torch.Generator().manual_seed(0))
     scores = score_view(rgb, depth(2), rgb, depth(2), EVERYWHERE)
-    assert scores == ImageScores(pytest.approx(100), pytest.approx(1), 0, pytest.approx(100))
+    assert scores == ImageScores(pytest.approx(100), pytest.approx(1), 0, pytest.approx(100), depth_rmse_m=0)
 
 
 def test_psnr_of_a_known_offset() -> None:
@@ -109,6 +116,54 @@ def test_means_are_over_the_frames_that_have_a_score() -> None:
     assert mean_scores([]) == ImageScores(None, None, None, None)
 
 
+def test_depth_rmse_by_hand() -> None:
+    rendered = depth(2.1)
+    rendered[:, : W // 2] = 2.3
+    scores = score_view(gray(0.5), rendered, gray(0.5), depth(2), EVERYWHERE)
+    assert scores.depth_l1_m == pytest.approx(0.2, abs=1e-6)
+    assert scores.depth_rmse_m == pytest.approx(math.sqrt((0.1**2 + 0.3**2) / 2), abs=1e-6)
+
+
+def test_whole_image_scores_come_from_the_distance_given() -> None:
+    scores = score_view(gray(0.9), depth(2), gray(0.5), depth(2), LEFT_QUARTER, lpips=lambda a, b: float((a - b).max()))
+    assert scores.lpips == pytest.approx(0.4)
+    assert scores.ms_ssim is None  # 60x40 is too small
+
+
+# --- as the original counts ---
+
+
+def seen(rgb: Tensor, depth_acc: Tensor, silhouette: float = 1.0) -> Render:
+    return Render(rgb, depth_acc, torch.full((H, W), silhouette))
+
+
+def test_the_original_counts_masked_pixels_as_perfect() -> None:
+    reading = torch.where(LEFT_QUARTER, 2.0, 0.0)
+    original = original_scores(seen(gray(0.6), depth(2)), gray(0.5), reading)
+    # The squared error of a quarter of the pixels, over all of them.
+    assert original.psnr_db == pytest.approx(20 + 10 * math.log10(4), abs=ROUND_OFF_DB)
+    honest = score_view(gray(0.6), depth(2), gray(0.5), reading, LEFT_QUARTER)
+    assert honest.psnr_db == pytest.approx(20, abs=ROUND_OFF_DB)
+
+
+def test_the_original_averages_the_channels_psnr_and_does_not_clamp() -> None:
+    rendered = torch.stack([depth(1.1), depth(1.01), depth(1.001)])  # too bright by 0.1, 0.01, 0.001
+    original = original_scores(seen(rendered, depth(2)), gray(1.0), depth(2))
+    assert original.psnr_db == pytest.approx((20 + 40 + 60) / 3, abs=1e-2)  # 0.001 of 1 keeps four digits in 32 bits
+    assert score_view(rendered, depth(2), gray(1.0), depth(2), EVERYWHERE).psnr_db == pytest.approx(100)
+
+
+def test_the_original_s_depth_is_not_divided_by_the_silhouette() -> None:
+    render = seen(gray(0.5), depth(0.9 * 2.0), silhouette=0.9)  # exactly at 2 m, but a tenth is seen through
+    assert original_scores(render, gray(0.5), depth(2)).depth_l1_m == pytest.approx(0.2, abs=1e-6)
+    assert score_view(gray(0.5), render.depth(), gray(0.5), depth(2), EVERYWHERE).depth_l1_m == pytest.approx(0, abs=1e-6)
+
+
+def test_the_original_s_scores_without_a_reading() -> None:
+    original = original_scores(seen(gray(0.6), depth(2)), gray(0.5), depth(0))
+    assert original.psnr_db == pytest.approx(100) and original.depth_l1_m is None  # two black images
+
+
 CAMERA = PinholeCamera(W, H, 50, 50, W / 2, H / 2)
 
 
@@ -143,3 +198,14 @@ def test_depth_out_of_range_is_no_reading_but_an_edge_is() -> None:
     frame = RgbdFrame(0, np.zeros((H, W, 3), np.uint8), depth_m, CAMERA)
     scorer = ViewScorer(wall(), make_rasterizer('cpu', 1), DepthConfig(min_m=0.2, max_m=5.0, edge_filter=0.05))
     assert scorer.view(frame).valid.numpy().tolist() == (depth_m == 2).tolist()
+
+
+def test_holes_are_readings_without_map() -> None:
+    """The camera turned round sees nothing of the map: every pixel with a reading, half of them, is a hole."""
+    scorer = ViewScorer(wall(), make_rasterizer('cpu', 1), DepthConfig())
+    depth_m = np.full((H, W), 2, np.float32)
+    depth_m[: H // 2] = 0
+    frame = RgbdFrame(0, np.zeros((H, W, 3), np.uint8), depth_m, CAMERA)
+    away = scorer.score(frame, se3.exp(np.array([0, 0, 0, 0, np.pi, 0])))
+    assert away.hole_share == pytest.approx(0.5) and away.has_holes
+    assert not scorer.score(frame, np.eye(4)).has_holes

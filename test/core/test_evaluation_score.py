@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import re
 from dataclasses import dataclass
 from functools import cached_property
+from html.parser import HTMLParser
 from pathlib import Path
 
 import cv2
@@ -16,8 +19,12 @@ from splatam_core import se3
 from splatam_core.camera import PinholeCamera
 from splatam_core.config import load_config
 from splatam_core.errors import FrameError, RunFolderError
+from splatam_core.evaluation.descriptions import DESCRIPTIONS
+from splatam_core.evaluation.html import html_report
+from splatam_core.evaluation.images import OriginalScores
+from splatam_core.evaluation.metrics import GROUPS, Metrics
 from splatam_core.evaluation.report import DPI, WIDTH_IN, write_report
-from splatam_core.evaluation.score import combine, score_images, score_trajectory
+from splatam_core.evaluation.score import combine, score_images, score_novel_views, score_trajectory
 from splatam_core.ply import write_ply
 from splatam_core.rasterizer import Gaussians, make_rasterizer
 from splatam_core.run_folder import MAP, RunDescription, RunFolder, RunRecord, Source, read_run
@@ -25,6 +32,7 @@ from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status, Tra
 
 CONFIG = load_config('quick', ['threads=1'])
 STEP_NS, COUNT, LOST = 33_333_333, 9, 4
+ORIGINAL = [entry.name for entry in dataclasses.fields(OriginalScores)]
 CAMERA = PinholeCamera(48, 36, 40.0, 40.0, 23.5, 17.5)
 T_TRUTH_WORLD = se3.exp(np.array([3.0, -1.0, 2.0, 0.3, 1.0, -0.5]))
 
@@ -171,3 +179,133 @@ def test_report_of_a_run_without_poses(tmp_path: Path) -> None:
     assert evaluation.metrics.frames == 0 and evaluation.metrics.ate_rmse_m is None
     write_report(evaluation, tmp_path / 'report.png')
     assert cv2.imread(str(tmp_path / 'report.png')) is not None
+
+
+# --- held-out and novel views ---
+
+
+def test_held_out_frames_are_scored_apart_whatever_every_says(tmp_path: Path) -> None:
+    sequence = Wall()
+    run = make_run(tmp_path, sequence)
+    run = dataclasses.replace(run, config=load_config('quick', ['threads=1', 'mapping.hold_out=3']))
+    images = score_images(run, sequence, 4, plain)
+    assert [(frame.stamp_ns - sequence.first_ns) // STEP_NS for frame in images.frames] == [0, 8]  # 4 is lost
+    assert [(frame.stamp_ns - sequence.first_ns) // STEP_NS for frame in images.held_out] == [2, 5, 8]
+    metrics = combine(run, None, images).metrics
+    assert metrics.heldout_frames == 3 and metrics.heldout.psnr_db > 55 and metrics.evaluated_frames == 2
+    assert set(run.mapped_poses()) == {sequence.first_ns + STEP_NS * index for index in (0, 1, 3, 6, 7)}
+    assert images.samples[-1].title == 'median held out'
+
+
+@dataclass(frozen=True)
+class Aside(Wall):
+    """A test split of the wall: from 10 cm beside the way, and from view 6 on turned round."""
+
+    name: str = 'wall_test'
+
+    def pose(self, index: int) -> np.ndarray:
+        turn = np.pi if index >= 6 else 0.0
+        return se3.exp(np.array([0.1, 0.0, 0, 0, 0, 0])) @ Wall.pose(self, index) @ se3.exp(np.array([0, 0, 0, 0, turn, 0]))
+
+    def __getitem__(self, index: int) -> RgbdFrame:
+        frame = Wall.__getitem__(self, index)
+        return dataclasses.replace(frame, depth_m=np.full_like(frame.depth_m, 2.0)) if index >= 6 else frame
+
+
+@pytest.mark.parametrize('alignment', ['trajectory', 'first'])
+def test_novel_views_are_rendered_at_true_poses_and_holes_apart(tmp_path: Path, alignment: str) -> None:
+    run, truth = make_run(tmp_path, Wall()), Wall().ground_truth()
+    novel = score_novel_views(run, truth, Aside(), alignment, plain)
+    metrics = combine(run, None, None, novel).metrics
+    assert (metrics.novel_frames, metrics.novel_holes_frames, metrics.novel_alignment) == (6, 3, alignment)
+    assert metrics.novel.psnr_db > 50  # 8 bits; alignment leaves the file's nine decimals
+    assert metrics.novel_holes.psnr_db is not None and metrics.novel_holes.depth_l1_m > 1.9  # nothing rendered at 2 m
+    assert metrics.splatam_novel.depth_l1_m == pytest.approx(0, abs=0.02)
+    written = Metrics.from_json(metrics.to_json())
+    assert written == metrics
+
+
+def test_a_wrong_first_pose_spoils_the_first_pose_s_alignment_only(tmp_path: Path) -> None:
+    run = make_run(tmp_path, Wall())
+    poses = run.trajectory.T_world_cam.copy()
+    poses[0] = poses[0] @ se3.exp(np.array([0, 0, 0, 0, np.radians(3), 0]))  # turned; its centre stays
+    run = dataclasses.replace(run, trajectory=Trajectory(run.trajectory.stamps_ns, poses))
+    by_all, by_first = (
+        combine(run, None, None, score_novel_views(run, Wall().ground_truth(), Aside(), how, plain)).metrics.novel.psnr_db
+        for how in ('trajectory', 'first')
+    )
+    assert by_all > by_first + 5  # one of eight rotations is wrong: an eighth of it enters the mean
+
+
+# --- the page ---
+
+
+class Page(HTMLParser):
+    """What a page is made of."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.links: list[str] = []
+        self.ids: list[str] = []
+        self.text = ''
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        for name, value in attrs:
+            if name in ('src', 'href', 'xlink:href'):
+                self.links.append(value or '')
+            if name == 'id':
+                self.ids.append(value or '')
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def check_page(text: str) -> Page:
+    """It needs nothing beside it, and its charts take colours that the page defines."""
+    page = Page(text)
+    assert all(link.startswith(('data:image/', '#')) for link in page.links)
+    assert not {'script', 'link', 'iframe'} & set(page.tags) and '@import' not in text
+    assert {url for url in re.findall(r'url\(([^)]*)\)', text) if not url.startswith('#')} == set()
+    assert set(re.findall(r'var\((--[a-z]+)\)', text)) <= set(re.findall(r'(--[a-z]+):', text))
+    referenced = set(re.findall(r'url\(#([^)]*)\)', text)) | {link[1:] for link in page.links if link.startswith('#')}
+    drawn = [name for name in page.ids if name in referenced]
+    assert referenced <= set(page.ids) and len(drawn) == len(set(drawn))  # no chart borrows another's clip path
+    return page
+
+
+@pytest.mark.parametrize(('with_truth', 'with_images'), [(True, True), (False, True), (True, False), (False, False)])
+def test_page_is_complete_and_needs_nothing_else(tmp_path: Path, with_truth: bool, with_images: bool) -> None:
+    sequence = Wall()
+    run = make_run(tmp_path / 'a run & <more>', sequence)
+    truth = score_trajectory(run, sequence.ground_truth()) if with_truth else None
+    images = score_images(run, sequence, 4, plain) if with_images else None
+    novel = score_novel_views(run, sequence.ground_truth(), Aside(), 'first', plain) if with_truth and with_images else None
+    page = check_page(html_report(combine(run, truth, images, novel)))
+    assert 'a run & <more>' in page.text and f'of {COUNT}' in page.text
+    assert ('ATE RMSE' in page.text) and ('tracking.iterations' in page.text)
+    assert page.tags.count('img') == 7 * (len(images.samples) if images else 0) + 7 * (len(novel.samples) if novel else 0)
+    assert ('novel view, with holes' in page.text) == (novel is not None)
+    assert ('No frames or no map' in page.text) == (not with_images)
+
+
+@pytest.mark.parametrize('frames', [0, 1])
+def test_page_of_hardly_a_run(tmp_path: Path, frames: int) -> None:
+    with RunFolder.create(tmp_path, CONFIG, RunDescription('splatam_node')) as folder:
+        for index in range(frames):
+            result = FrameResult(index, 5, Status.INITIALIZED, np.eye(4), True, 10, 1.0, 1.0, '', StageTimings(total=1.0))
+            folder.append(Wall()[0], result, 0.01)
+    page = check_page(html_report(combine(read_run(tmp_path), None, None)))
+    assert f'of {frames}' in page.text
+
+
+def test_every_number_is_described_once() -> None:
+    numbers = set(Metrics(0, 0, 0, None, None, None, None, {}).values()) - {'timings_ms', 'notes'}
+    described = [description.name for group in DESCRIPTIONS.values() for description in group]
+    assert sorted(described) == sorted(numbers)
+    page = (Path(__file__).resolve().parents[2] / 'docs' / 'evaluation.md').read_text()
+    own = {entry.name for entry in dataclasses.fields(Metrics)} - set(GROUPS) | {f'splatam_{name}' for name in ORIGINAL}
+    assert [name for name in own if f'`{name}`' not in page] == []
+    assert [group for group in GROUPS if f'`{group}_' not in page] == []

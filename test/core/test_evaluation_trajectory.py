@@ -10,8 +10,13 @@ from splatam_core.errors import RunFolderError
 from splatam_core.evaluation.trajectory import (
     MAX_TRUTH_GAP_NS,
     STAMP_ROUNDING_NS,
+    RelativePoseError,
     align,
+    align_poses,
     interpolate_centres,
+    interpolate_poses,
+    relative_pose_errors,
+    splatam_ate_mean_m,
     trajectory_error,
     transformed,
 )
@@ -142,3 +147,102 @@ def test_other_clock_is_an_error_that_names_both_spans() -> None:
     nothing = Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
     with pytest.raises(RunFolderError, match='the truth nothing'):
         trajectory_error(truth, nothing)
+
+
+# --- relative pose errors ---
+
+
+def at_30_hz(poses: list[np.ndarray]) -> Trajectory:
+    return Trajectory(EPOCH_NS + STEP_NS * np.arange(len(poses)), np.array(poses))
+
+
+def test_relative_errors_of_a_drift_by_hand() -> None:
+    """Each step is 1 mm and 0.1 degrees too long: that per frame, thirty times as much per second (999.99999 ms)."""
+    step, wrong = np.array([0.02, 0, 0, 0, 0, 0]), np.array([0.021, 0, 0, 0, 0, 0])
+    turn = np.array([0, 0, 0, 0, np.radians(0.5), 0]), np.array([0, 0, 0, 0, np.radians(0.6), 0])
+    moving = [at_30_hz([se3.exp(i * twist) for i in range(61)]) for twist in (step, wrong)]
+    per_frame, per_second = relative_pose_errors(moving[1], moving[0])
+    assert (per_frame.pairs, per_second.pairs) == (60, 31)
+    assert per_frame.translation_rmse_m == pytest.approx(0.001, abs=ROUND_OFF_M)
+    assert per_second.translation_rmse_m == pytest.approx(0.030, abs=ROUND_OFF_M)
+    turning = [at_30_hz([se3.exp(i * twist) for i in range(61)]) for twist in turn]
+    per_frame, per_second = relative_pose_errors(turning[1], turning[0])
+    assert per_frame.rotation_rmse_deg == pytest.approx(0.1, abs=1e-6)  # an angle this small keeps half its digits
+    assert per_second.rotation_rmse_deg == pytest.approx(3.0, abs=1e-6)
+
+
+def test_relative_errors_do_not_see_which_world_the_truth_is_in() -> None:
+    truth = wandering(40)
+    elsewhere = transformed(truth, se3.exp(np.array([3.0, -2, 1, 0.5, 1, -2])))
+    for error in relative_pose_errors(truth, elsewhere):
+        assert error.translation_rmse_m == pytest.approx(0, abs=1e-10)
+        assert error.rotation_rmse_deg == pytest.approx(0, abs=1e-4)
+
+
+def test_one_jump_is_one_wrong_step() -> None:
+    truth = wandering(50)
+    jumped = moved(truth, np.where(np.arange(50)[:, None] >= 20, [0.1, 0, 0], 0.0))
+    per_frame, _ = relative_pose_errors(jumped, truth)
+    assert per_frame.translation_rmse_m == pytest.approx(0.1 / np.sqrt(49), abs=ROUND_OFF_M)
+
+
+def test_no_step_is_taken_over_lost_frames() -> None:
+    truth = wandering(50)
+    tracked = np.arange(50) != 25
+    estimate = Trajectory(truth.stamps_ns[tracked], truth.T_world_cam[tracked])
+    assert relative_pose_errors(estimate, truth)[0].pairs == 48  # 24 to 26 is the next tracked frame
+    assert relative_pose_errors(estimate, truth, [int(truth.stamps_ns[25])])[0].pairs == 47
+
+
+def test_without_a_frame_a_second_later_there_is_no_such_error() -> None:
+    truth = wandering(20)
+    per_frame, per_second = relative_pose_errors(truth, truth)
+    assert per_frame.pairs == 19
+    assert per_second == RelativePoseError(None, None, 0)
+    nothing = Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
+    assert relative_pose_errors(nothing, truth) == (RelativePoseError(None, None, 0),) * 2
+
+
+def test_poses_between_two_true_ones() -> None:
+    turned = se3.exp(np.array([1.0, 0, 0, 0, 0, np.pi / 2]))
+    turned[:3, 3] = [1.0, 0, 0]
+    truth = Trajectory(np.array([0, 400_000_000]), np.array([np.eye(4), turned]))
+    poses, known = interpolate_poses(truth, np.array([0, 100_000_000, 400_000_000, 900_000_000]))
+    assert known.tolist() == [True, True, True, False]
+    assert poses[1, :3, 3] == pytest.approx([0.25, 0, 0])
+    assert se3.rotation_vector(poses[1, :3, :3]) == pytest.approx([0, 0, np.pi / 8])
+    assert np.allclose(poses[[0, 2]], truth.T_world_cam, atol=ROUND_OFF_M)
+
+
+# --- what the original computes ---
+
+
+def test_the_original_s_ate_is_a_mean_of_world_to_camera_translations() -> None:
+    """Cameras that do not turn have -c there: then it is the mean distance of the centres, aligned."""
+    noise = np.array([[0, 0, 0.04], [0, 0, -0.04], [0, 0, 0.04], [0, 0, -0.04]])
+    estimate, truth = square(noise)
+    assert splatam_ate_mean_m(estimate, truth) == pytest.approx(0.04, abs=1e-3)  # the first pose's own error tilts nothing
+
+
+def test_the_original_s_ate_sees_a_turn_with_the_distance_from_the_origin() -> None:
+    """Ten metres out, half a degree of wrong rotation in every second pose: no centre is off, the original's is by cm."""
+    truth = at_30_hz([se3.compose(np.array([1.0, 0, 0, 0]), np.array([1.0 * i, i % 3, i % 2])) for i in range(11)])
+    T = truth.T_world_cam.copy()
+    T[1::2, :3, :3] = se3.exp(np.array([0, 0, 0, 0, np.radians(0.5), 0]))[:3, :3]
+    turned = Trajectory(truth.stamps_ns, T)
+    assert trajectory_error(turned, truth).rmse_m == pytest.approx(0, abs=ROUND_OFF_M)
+    assert splatam_ate_mean_m(turned, truth) > 0.01
+
+
+def test_poses_are_aligned_where_centres_leave_it_open() -> None:
+    """Along a line the centres do not tell how the world is turned about it; the cameras' rotations do."""
+    truth = at_30_hz([se3.exp(np.array([0.1 * i, 0, 0, 0, 0, 0])) for i in range(5)])
+    T = se3.exp(np.array([1.0, 2, 3, 0.4, -0.5, 0.6]))
+    assert np.allclose(align_poses(truth.T_world_cam, transformed(truth, T).T_world_cam), T, atol=ROUND_OFF_M)
+    assert np.allclose(align_poses(truth.T_world_cam[:1], transformed(truth, T).T_world_cam[:1]), T, atol=ROUND_OFF_M)
+
+
+def test_aligned_poses_share_the_error() -> None:
+    truth = wandering(4)
+    off = np.array([[0.03, 0, 0], [-0.03, 0, 0], [0, 0.03, 0], [0, -0.03, 0]])  # cancels out
+    assert np.allclose(align_poses(truth.T_world_cam, moved(truth, off).T_world_cam), np.eye(4), atol=ROUND_OFF_M)

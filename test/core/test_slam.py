@@ -13,7 +13,7 @@ from splatam_core import se3
 from splatam_core.camera import PinholeCamera
 from splatam_core.config import TrackingConfig, load_config
 from splatam_core.datasets import open_sequence
-from splatam_core.errors import FrameError, SplatamError
+from splatam_core.errors import ConfigError, FrameError, SplatamError
 from splatam_core.motion import MotionModel
 from splatam_core.rasterizer import make_rasterizer
 from splatam_core.slam import Slam
@@ -386,3 +386,31 @@ def test_a_camera_that_was_placed_is_at_rest() -> None:
         np.testing.assert_array_equal(motion.predict(stamp_ns), elsewhere)
     motion.observe(5, moved)  # earlier than what was seen before: no velocity is made of it
     np.testing.assert_array_equal(motion.predict(10**9), moved)
+
+
+def test_held_out_frames_are_tracked_but_never_mapped(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    frames, _ = room
+    slam, sizes, results = _slam('mapping.hold_out=3'), [0], []
+    for frame in frames:
+        before = slam.snapshot().means
+        results.append(slam.process(frame))
+        sizes.append(slam.num_gaussians)
+        if slam.config.mapping.is_held_out(results[-1].index):
+            assert np.array_equal(slam.snapshot().means, before)
+    assert [r.index for r in results if slam.config.mapping.is_held_out(r.index)] == [2, 5, 8]
+    assert all(r.status is Status.TRACKED for r in results[1:])
+    # The rhythm of the others is that of a recording without those frames: every fifth of 0, 1, 3, 4, 6, 7, 9.
+    assert [r.index for r in results if r.is_keyframe] == [0, 7]
+
+
+def test_a_map_does_not_start_on_a_held_out_frame(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    frames, _ = room
+    slam = _slam('mapping.hold_out=2')
+    dark = dataclasses.replace(frames[0], depth_m=np.zeros_like(frames[0].depth_m))
+    statuses = [slam.process(frame).status for frame in (dark, *frames[1:3])]
+    assert statuses == [Status.LOST, Status.LOST, Status.INITIALIZED]
+
+
+def test_holding_out_everything_is_refused() -> None:
+    with pytest.raises(ConfigError, match='at least 2'):
+        load_config('quick', ['mapping.hold_out=1'])

@@ -1,0 +1,177 @@
+"""``splatam evaluate``: score a run and draw its report."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatam_core.commands.shared import (
+    BAG_SUFFIXES,
+    Command,
+    add_run_argument,
+    open_run,
+    open_source,
+    positive,
+    progress,
+    say,
+)
+from splatam_core.errors import DatasetError, RunFolderError, SplatamError
+
+if TYPE_CHECKING:
+    from splatam_core.datasets.base import Sequence
+    from splatam_core.evaluation.metrics import Metrics
+    from splatam_core.evaluation.score import NovelViews
+    from splatam_core.run_folder import RunRecord
+    from splatam_core.types import Trajectory
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_run_argument(parser)
+    parser.add_argument(
+        '--truth', metavar='FILE|BAG|DATASET', help="TUM trajectory, bag or dataset (default: the run's own source)"
+    )
+    parser.add_argument(
+        '--every', type=positive, default=1, metavar='N', help='score the images of every n-th frame only'
+    )
+    parser.add_argument(
+        '--novel-views', nargs='?', choices=('trajectory', 'first'), const='trajectory', metavar='ALIGNMENT',
+        help="also score the test split of the run's dataset at its true poses, brought into the map by the alignment "
+        "of the whole 'trajectory' (default) or by its 'first' pose, as the original does",
+    )  # fmt: skip
+
+
+def evaluate(args: argparse.Namespace) -> int:
+    """Score a run and draw its report."""
+    from splatam_core.run_folder import MAP
+
+    run = open_run(args.dir)
+    truth, sequence = _truth_and_frames(run, args.truth)
+    if sequence is not None and not (run.path / MAP).is_file():
+        say(f'{run.path} has no {MAP}, the run ended before it was saved: trajectory only')
+        sequence = None
+    novel = _score_novel_views(run, args.novel_views) if args.novel_views else None
+    print_summary(score(run, truth, sequence, args.every, novel), args.dir)
+    return 0
+
+
+def score(
+    run: RunRecord, truth: Trajectory | None, sequence: Sequence | None, every: int, novel: NovelViews | None = None
+) -> Metrics:
+    """Score, then write ``metrics.json`` and the reports; an error leaves them as they are."""
+    from splatam_core.evaluation.html import write_html
+    from splatam_core.evaluation.report import write_report
+    from splatam_core.evaluation.score import combine, score_images, score_trajectory
+    from splatam_core.files import replace_text
+    from splatam_core.run_folder import METRICS, PAGE, REPORT
+
+    against_truth = None if truth is None else score_trajectory(run, truth)
+    against_images = None if sequence is None else score_images(run, sequence, every, progress('scoring'))
+    evaluation = combine(run, against_truth, against_images, novel)
+    replace_text(run.path / METRICS, evaluation.metrics.to_json())
+    write_report(evaluation, run.path / REPORT)
+    write_html(evaluation, run.path / PAGE)
+    return evaluation.metrics
+
+
+def score_own_run(run: RunRecord, sequence: Sequence, every: int = 1) -> Metrics:
+    """Score a run just done; where too little was tracked to compare with the truth, the images only."""
+    try:
+        return score(run, sequence.ground_truth(), sequence, every)
+    except RunFolderError as error:
+        say(f'no trajectory error: {error}')
+        return score(run, None, sequence, every)
+
+
+def _truth_and_frames(run: RunRecord, given: str | None) -> tuple[Trajectory | None, Sequence | None]:
+    """What to score against. The run's own source shows the frames where it can be opened."""
+    from splatam_core.run_folder import Source
+    from splatam_core.trajectory import read_trajectory
+
+    if given is None:
+        if run.description.source is None:
+            raise RunFolderError(f'{run.path} does not say where its frames came from: pass --truth FILE|BAG|DATASET')
+        sequence = open_source(run.description.source)
+        return sequence.ground_truth(), sequence
+    own = _open_own_source(run)
+    if Path(given).is_file() and Path(given).suffix not in BAG_SUFFIXES:
+        return read_trajectory(Path(given)), own
+    other = open_source(Source(given, width=run.camera.width if run.camera else None))
+    truth = other.ground_truth()
+    if truth is None:
+        say(f'{given} has no true poses: images only')
+    return truth, other if own is None else own
+
+
+def _open_own_source(run: RunRecord) -> Sequence | None:
+    if run.description.source is None:
+        return None
+    try:
+        return open_source(run.description.source)
+    except SplatamError as error:
+        say(f"the run's own source is not used: {error}")
+        return None
+
+
+def _score_novel_views(run: RunRecord, alignment: str) -> NovelViews:
+    from splatam_core.evaluation.score import score_novel_views
+
+    source = run.description.source
+    if source is None or source.split == 'test':
+        which = 'live topics' if source is None else 'a test split'
+        raise RunFolderError(f"{run.path} is a run over {which}: novel views need a run over a dataset's train split")
+    truth = open_source(source).ground_truth()
+    try:
+        test = open_source(replace(source, split='test', start=0, max_frames=None, stride=1))
+    except DatasetError as error:
+        raise RunFolderError(f'--novel-views needs a dataset with a test split: {error}') from None
+    if truth is None:
+        raise RunFolderError(f'{source.path} has no true poses: novel views are rendered at those')
+    return score_novel_views(run, truth, test, alignment, progress('novel views', 'view'))
+
+
+def print_summary(metrics: Metrics, folder: Path) -> None:
+    """The headline numbers, one a line."""
+    m, notes = metrics, metrics.notes
+    rows = [
+        ('tracked', f'{m.tracked} of {m.frames} frames'),
+        ('speed', _text(m.fps, 1, '.2f', 'fps, decoding excluded')),
+        ('ATE RMSE', _text(m.ate_rmse_m, 100, '.2f', 'cm')),
+        ('RPE', _relative(m)),
+        ('PSNR', _text(m.psnr_db, 1, '.2f', 'dB')),
+        ('SSIM', _text(m.ssim, 1, '.3f', '')),
+        ('MS-SSIM', _text(m.ms_ssim, 1, '.3f', '', notes.get('ms_ssim'))),
+        ('LPIPS', _text(m.lpips, 1, '.3f', '', notes.get('lpips'))),
+        ('depth L1', _text(m.depth_l1_m, 100, '.2f', 'cm')),
+        ('depth RMSE', _text(m.depth_rmse_m, 100, '.2f', 'cm')),
+    ]
+    if m.heldout_frames:
+        scores = f'{_text(m.heldout.psnr_db, 1, ".2f", "dB")}, depth L1 {_text(m.heldout.depth_l1_m, 100, ".2f", "cm")}'
+        rows.append(('held out', f'PSNR {scores}; {m.heldout_frames} frames kept out of the map'))
+    if m.novel_alignment:
+        scores = f'{_text(m.novel.psnr_db, 1, ".2f", "dB")}, depth L1 {_text(m.novel.depth_l1_m, 100, ".2f", "cm")}'
+        rows.append(
+            ('novel', f'PSNR {scores}; {m.novel_frames} views without holes, {m.novel_holes_frames} with apart')
+        )
+    rows += [('Gaussians', _text(m.num_gaussians, 1, ',', '')), ('results', str(folder))]
+    for name, value in rows:
+        print(f'{name:<10} {value}'.rstrip())
+
+
+def _relative(metrics: Metrics) -> str:
+    if metrics.rpe_trans_frame_m is None:
+        return 'not known'
+    per_frame = f'{metrics.rpe_trans_frame_m * 1e3:.2f} mm, {metrics.rpe_rot_frame_deg:.3f} deg a frame'
+    if metrics.rpe_trans_1s_m is None:
+        return per_frame
+    return f'{per_frame}; {metrics.rpe_trans_1s_m * 1e3:.1f} mm, {metrics.rpe_rot_1s_deg:.2f} deg a second'
+
+
+def _text(value: float | None, factor: float, digits: str, unit: str, why_not: str | None = None) -> str:
+    if value is None:
+        return f'not known: {why_not}' if why_not else 'not known'
+    return f'{value * factor:{digits}} {unit}'.rstrip()
+
+
+COMMAND = Command('evaluate', 'score a run and draw its report', _add_arguments, evaluate)

@@ -1,0 +1,93 @@
+"""``splatam export``: a run's map as a file for other programs."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatam_core.commands.shared import Command, add_run_argument, open_run, positive, progress
+from splatam_core.errors import ExportError
+
+if TYPE_CHECKING:
+    from splatam_core.export import Surface
+    from splatam_core.rasterizer import Gaussians
+    from splatam_core.run_folder import RunRecord
+
+FORMS = ('gaussians', 'points', 'mesh')
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_run_argument(parser)
+    parser.add_argument('file', type=Path, metavar='FILE', help='the .ply file to write')
+    parser.add_argument(
+        '--as', dest='form', choices=FORMS, default='gaussians',
+        help="'gaussians' for splat viewers (default), 'points' for coloured centres, 'mesh' for the surface fused from "
+        "rendered depth (pip install 'splatam_ros[mesh]')",
+    )  # fmt: skip
+    parser.add_argument('--overwrite', action='store_true', help='replace FILE')
+    parser.add_argument(
+        '--min-opacity',
+        type=_number,
+        default=0.5,
+        metavar='O',
+        help='of points: leave out fainter ones (default: %(default)s)',
+    )
+    parser.add_argument(
+        '--voxel', type=_number, default=0.01, metavar='M', help='of a mesh: metres (default: %(default)s)'
+    )
+    parser.add_argument(
+        '--max-depth',
+        type=_number,
+        default=6.0,
+        metavar='M',
+        help='of a mesh: leave out what is farther (default: %(default)s)',
+    )
+    parser.add_argument(
+        '--every', type=positive, default=5, metavar='N', help='of a mesh: fuse every n-th frame (default: %(default)s)'
+    )
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f'{text} is not above 0')
+    return value
+
+
+def export(args: argparse.Namespace) -> int:
+    """Write a run's map as a file for other programs."""
+    from splatam_core.export import centres
+    from splatam_core.ply import write_ply, write_surface
+
+    if args.file.suffix.lower() != '.ply':
+        raise ExportError(f"{args.file}: '{args.file.suffix}' files are not written; name it .ply")
+    if args.file.exists() and not args.overwrite:
+        raise ExportError(f'{args.file} exists: choose another name, or replace it with --overwrite')
+    run = open_run(args.dir)
+    gaussians = run.read_map()
+    try:
+        if args.form == 'gaussians':
+            write_ply(args.file, gaussians)
+            print(f'{len(gaussians)} Gaussians are in {args.file}')
+            return 0
+        surface = centres(gaussians, args.min_opacity) if args.form == 'points' else _mesh(args, run, gaussians)
+        write_surface(args.file, surface.points_m, surface.rgb, surface.triangles)
+    except OSError as error:
+        raise ExportError(f'{args.file}: cannot be written: {error.strerror}') from None
+    faces = '' if surface.triangles is None else f' and {len(surface.triangles)} triangles'
+    print(f'{len(surface.points_m)} points{faces} are in {args.file}')
+    return 0
+
+
+def _mesh(args: argparse.Namespace, run: RunRecord, gaussians: Gaussians) -> Surface:
+    from splatam_core.export import fused_mesh
+    from splatam_core.rasterizer import make_rasterizer
+
+    return fused_mesh(
+        gaussians, make_rasterizer(run.config.rasterizer, run.config.threads), run.camera_or_error(),
+        run.trajectory.T_world_cam[:: args.every], args.voxel, args.max_depth, progress('fusing', 'view'),
+    )  # fmt: skip
+
+
+COMMAND = Command('export', "write a run's map as Gaussians, points or a mesh", _add_arguments, export)

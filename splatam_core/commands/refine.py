@@ -1,0 +1,49 @@
+"""``splatam refine``: optimise a finished map over all frames of its run."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from splatam_core.commands.evaluate import print_summary, score_own_run
+from splatam_core.commands.shared import Command, add_run_argument, open_run, open_source, positive, progress
+from splatam_core.errors import RunFolderError
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_run_argument(parser)
+    parser.add_argument('--out', type=Path, required=True, metavar='DIR', help='folder for the refined run')
+    parser.add_argument('--iterations', type=positive, default=2000, metavar='N', help='steps (default: %(default)s)')
+    parser.add_argument(
+        '--every', type=positive, default=1, metavar='N', help='score every n-th frame only, before and after'
+    )
+
+
+def refine(args: argparse.Namespace) -> int:
+    """Optimise a finished map over all frames of its run."""
+    from splatam_core.evaluation.images import mean_scores
+    from splatam_core.evaluation.score import score_images
+    from splatam_core.rasterizer import make_rasterizer
+    from splatam_core.refinement import refine_map
+    from splatam_core.run_folder import check_is_free, read_run, write_refined
+
+    run = open_run(args.dir)
+    gaussians = run.read_map()
+    if run.description.source is None:
+        raise RunFolderError(f'{args.dir} does not say where its frames came from, so they cannot be read again')
+    check_is_free(args.out)
+    sequence = open_source(run.description.source)
+    before = mean_scores(score_images(run, sequence, args.every, progress('scoring')).frames)
+    refined = refine_map(
+        gaussians, sequence, run.mapped_poses(), make_rasterizer(run.config.rasterizer, run.config.threads), run.config,
+        args.iterations, progress('refining', 'step'),
+    )  # fmt: skip
+    write_refined(run, args.out, refined, args.iterations)
+    metrics = score_own_run(read_run(args.out), sequence, args.every)
+    print_summary(metrics, args.out)
+    if before.psnr_db is not None and metrics.psnr_db is not None:
+        print(f'PSNR was {before.psnr_db:.2f} dB, is {metrics.psnr_db:.2f} dB')
+    return 0
+
+
+COMMAND = Command('refine', 'optimise a finished map over all frames of its run', _add_arguments, refine)

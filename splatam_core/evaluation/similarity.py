@@ -1,0 +1,100 @@
+"""How alike two images look: MS-SSIM, and LPIPS where its library and its weights are at hand."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from splatam_core.losses import ssim_terms
+
+SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+"""Of the five scales, finest first (Wang et al. 2003, section 3.2)."""
+
+WINDOW_MARGIN = 5
+MIN_SIDE = 161
+"""Pixels; else the 11 pixel window does not fit into the coarsest scale."""
+
+LPIPS_NETWORK = 'alex'
+LPIPS_MIN_SIDE = 31
+"""Pixels; else nothing is left after AlexNet's second pooling."""
+
+
+def ms_ssim(a: Tensor, b: Tensor) -> float | None:
+    """Multi-scale structural similarity of whole images.
+
+    Wang, Simoncelli, Bovik, "Multi-scale structural similarity for image quality assessment", 2003, equation 7:
+    contrast and structure at five scales, luminance at the coarsest, where the window lies inside the image. Halving
+    pads odd sizes with zeros, and a negative factor counts as zero, as in ``pytorch_msssim``, which the original uses.
+
+    Args:
+        a: [3, H, W] in [0, 1].
+        b: the same.
+
+    Returns:
+        The mean over the channels; None for images under 161 pixels on the short side.
+    """
+    if min(a.shape[-2:]) < MIN_SIDE:
+        return None
+    similarity = torch.ones(len(a))
+    for scale, weight in enumerate(SCALE_WEIGHTS):
+        if scale:
+            a, b = _halved(a), _halved(b)
+        luminance, structure = (_inside(term) for term in ssim_terms(a, b))
+        is_coarsest = scale == len(SCALE_WEIGHTS) - 1
+        factor = (luminance * structure if is_coarsest else structure).mean(dim=(1, 2))
+        similarity = similarity * factor.clamp(min=0) ** weight
+    return float(similarity.mean())
+
+
+def _halved(image: Tensor) -> Tensor:
+    padding = [size % 2 for size in image.shape[-2:]]
+    return functional.avg_pool2d(image, kernel_size=2, padding=padding)
+
+
+def _inside(values: Tensor) -> Tensor:
+    return values[:, WINDOW_MARGIN:-WINDOW_MARGIN, WINDOW_MARGIN:-WINDOW_MARGIN]
+
+
+@dataclass(frozen=True, slots=True)
+class Lpips:
+    """Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018; AlexNet.
+
+    Attributes:
+        network: of the ``lpips`` package.
+    """
+
+    network: Any
+
+    def __call__(self, a: Tensor, b: Tensor) -> float | None:
+        """Distance of two [3, H, W] images in [0, 1]; None where they are too small."""
+        if min(a.shape[-2:]) < LPIPS_MIN_SIDE:
+            return None
+        with torch.no_grad():
+            return float(self.network(a[None], b[None], normalize=True))
+
+
+@lru_cache(maxsize=1)
+def load_lpips() -> Lpips | str:
+    """LPIPS, or why there is none here."""
+    try:
+        import lpips
+    except ImportError as error:
+        return f"{error}: pip install 'splatam_ros[lpips]', with the torchvision that fits the installed torch"
+    except RuntimeError as error:  # torchvision built for another torch
+        return f'torchvision does not fit the installed torch: {_first_line(error)}'
+    try:
+        with contextlib.redirect_stdout(None):  # torchvision prints that it downloads
+            network = lpips.LPIPS(net=LPIPS_NETWORK, verbose=False)
+    except (OSError, RuntimeError) as error:
+        return f'the weights of AlexNet cannot be loaded: {_first_line(error)}'
+    return Lpips(network.eval())
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
