@@ -31,3 +31,7 @@ class MapFileError(SplatamError):
 
 class RasterizerError(SplatamError):
     """A rasterizer backend that is missing, or was given what it cannot render."""
+
+
+class CheckpointError(SplatamError):
+    """A checkpoint that is missing, damaged, or of another run."""
