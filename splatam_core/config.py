@@ -106,6 +106,7 @@ class TrackingConfig:
     )
     iterations: int = _setting(40, 'Steps per frame; of alignment, at most per resolution.', '', 0)
     exposure: bool = _setting(True, "Of alignment: take up changes of the camera's exposure.")
+    lag: bool = _setting(True, 'Of alignment: take up that colour and depth of a frame were taken at different times.')
     rotation_rate: float = _setting(4e-4, 'Adam step of the unit quaternion.', '', 0.0)
     translation_rate: float = _setting(2e-3, 'Adam step of the translation.', 'm', 0.0)
     color_weight: float = _setting(0.5, 'Weight of the colour L1.', '', 0.0)
