@@ -149,7 +149,7 @@ def _begin(args: argparse.Namespace) -> _Job:
     from splatam_core.slam import Slam
 
     if args.source is None or args.out is None:
-        raise SplatamError('a run needs SOURCE and --out DIR, or --resume DIR to go on with one')
+        make_parser().error('run needs SOURCE and --out DIR, or --resume DIR to go on with one')
     config = load_config(args.preset, args.set)
     apply_threads(config)
     source = _source(args)
