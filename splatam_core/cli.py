@@ -20,6 +20,7 @@ from splatam_core.errors import DatasetError, FrameError, RunFolderError, Splata
 # Whatever takes time to import (torch, OpenCV, matplotlib) is imported by the command that needs it.
 if TYPE_CHECKING:
     from splatam_core.datasets.base import Sequence as FrameSequence
+    from splatam_core.resuming import CheckpointWriter
     from splatam_core.run_folder import RunFolder
     from splatam_core.slam import Slam
 
@@ -56,50 +57,124 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
-    add_source_arguments(parser)
+    add_source_arguments(parser, optional=True)
     parser.add_argument('--preset', default='splatam', help='a shipped preset or a .yaml file (default: %(default)s)')
     parser.add_argument(
         '--set', action='append', default=[], metavar='KEY=VALUE', help='change a setting; may be given several times'
     )
-    parser.add_argument('--out', type=Path, required=True, metavar='DIR', help='folder for the results')
+    parser.add_argument('--out', type=Path, metavar='DIR', help='folder for the results')
     parser.add_argument('--overwrite', action='store_true', help='replace the run that is in DIR')
     parser.add_argument(
         '--holdout', type=positive, metavar='N',
         help='track every n-th frame, but keep it out of the map to score it on; the same as --set mapping.hold_out=N',
     )  # fmt: skip
+        '--checkpoint-every', type=positive, metavar='N', help='save all that --resume needs after every n-th frame'
+    )
+    parser.add_argument(
+        '--keep-checkpoints', type=positive, metavar='K', help='remove all but the last K checkpoints (default: 2)'
+    )
+    parser.add_argument(
+        '--resume', type=Path, metavar='DIR', help='go on from the last checkpoint of the run in DIR, to the same result'
+    )
     parser.add_argument('--no-evaluate', action='store_true', help='leave out scores of images and truth, and report')
 
 
 def run(args: argparse.Namespace) -> int:
-    """``splatam run``: SLAM over a recording."""
+    """``splatam run``: SLAM over a recording, from its beginning or from a checkpoint."""
+    from splatam_core.run_folder import read_run
+
+    job = _begin(args) if args.resume is None else _resume(args)
+    path, length = job.folder.path, len(job.sequence)
+    try:
+        with job.folder, _StopRequest() as stop:
+            failure = _process(job, stop)
+            if failure is not None or stop.requested:
+                job.checkpoints.at_stop(job.slam)
+            metrics = job.folder.finish(job.slam)
+    except OSError as error:
+        raise RunFolderError(f'{path}: cannot be written: {error.strerror}; make room{_resume_hint(path)}') from None
+    if failure is not None:
+        say(f'what was done before the error is in {path}{_resume_hint(path)}')
+        raise failure
+    if stop.requested:
+        say(f'stopped after {metrics.frames} of {length} frames; all of it is in {path}{_resume_hint(path)}')
+        say(f"'splatam evaluate {path}' scores it")
+        return EXIT_INTERRUPTED
+    if metrics.frames == 0:
+        raise RunFolderError(f'{job.sequence.name}: not one of its {length} frames could be used; see above')
+    if not args.no_evaluate:
+        metrics = score_own_run(read_run(path), job.sequence)
+    print_summary(metrics, path)
+    return 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Job:
+    """A run about to begin, or to go on.
+
+    Attributes:
+        sequence: its frames.
+        first: index of the first one to process.
+        slam: ready for it.
+        folder: ready for it.
+        checkpoints: saves them.
+    """
+
+    sequence: FrameSequence
+    first: int
+    slam: Slam
+    folder: RunFolder
+    checkpoints: CheckpointWriter
+
+
+def _begin(args: argparse.Namespace) -> _Job:
     from splatam_core.config import apply_threads, load_config
-    from splatam_core.run_folder import RunDescription, RunFolder, read_run
+    from splatam_core.resuming import CheckpointWriter
+    from splatam_core.run_folder import KEEP_CHECKPOINTS, RunDescription, RunFolder
     from splatam_core.slam import Slam
 
+    if args.source is None or args.out is None:
+        make_parser().error('run needs SOURCE and --out DIR, or --resume DIR to go on with one')
     held_out = [f'mapping.hold_out={args.holdout}'] if args.holdout else []
     config = load_config(args.preset, [*args.set, *held_out])
     apply_threads(config)
     source = source_of(args)
     sequence = open_source(source)
-    description = RunDescription('splatam run', args.preset, source)
+    every, keep = args.checkpoint_every, args.keep_checkpoints or KEEP_CHECKPOINTS
+    description = RunDescription('splatam run', args.preset, source, every, keep)
     folder = RunFolder.create(args.out, config, description, overwrite=args.overwrite)
-    with folder, _StopRequest() as stop:
-        slam = Slam(config)
-        failure = _process(sequence, slam, folder, stop)
-        metrics = folder.finish(slam)
-    if failure is not None:
-        say(f'what was done before the error is in {args.out}')
-        raise failure
-    if stop.requested:
-        say(f'stopped after {metrics.frames} of {len(sequence)} frames; all of it is in {args.out}')
-        say(f"'splatam evaluate {args.out}' scores it")
-        return EXIT_INTERRUPTED
-    if metrics.frames == 0:
-        raise RunFolderError(f'{sequence.name}: not one of its {len(sequence)} frames could be used; see above')
-    if not args.no_evaluate:
-        metrics = score_own_run(read_run(args.out), sequence)
-    print_summary(metrics, args.out)
-    return 0
+    return _Job(sequence, 0, Slam(config), folder, CheckpointWriter(folder, len(sequence), every, keep, say))
+
+
+def _resume(args: argparse.Namespace) -> _Job:
+    from splatam_core.config import apply_threads
+    from splatam_core.resuming import CheckpointWriter, resume
+
+    _check_is_all(args)
+    run = resume(args.resume, open_source, apply_threads, say)
+    description = run.settings.description
+    every = args.checkpoint_every or description.checkpoint_every
+    keep = args.keep_checkpoints or description.keep_checkpoints
+    say(f'going on with {args.resume} at frame {run.first} of {len(run.sequence)}')
+    writer = CheckpointWriter(run.folder, len(run.sequence), every, keep, say)
+    return _Job(run.sequence, run.first, run.slam, run.folder, writer)
+
+
+def _check_is_all(args: argparse.Namespace) -> None:
+    """Make sure that nothing was asked for that the resumed run has settled already."""
+    free = {'resume', 'run', 'checkpoint_every', 'keep_checkpoints', 'no_evaluate'}
+    defaults = make_parser().parse_args(['run'])
+    given = [name for name, value in vars(args).items() if name not in free and value != getattr(defaults, name)]
+    if given:
+        names = ', '.join('SOURCE' if name == 'source' else '--' + name.replace('_', '-') for name in given)
+        raise SplatamError(f'--resume takes source and settings from the folder: leave out {names}')
+
+
+def _resume_hint(path: Path) -> str:
+    from splatam_core.checkpoints import checkpoint_paths
+    from splatam_core.run_folder import CHECKPOINTS
+
+    return f"; 'splatam run --resume {path}' goes on" if checkpoint_paths(path / CHECKPOINTS) else ''
 
 
 class _StopRequest:
@@ -123,26 +198,28 @@ class _StopRequest:
         say('stopping after this frame; Ctrl-C again stops at once, without saving the map')
 
 
-def _process(sequence: FrameSequence, slam: Slam, folder: RunFolder, stop: _StopRequest) -> DatasetError | None:
+def _process(job: _Job, stop: _StopRequest) -> DatasetError | None:
     """Process frame after frame, to the end or to a stop request. Returns what broke the recording, if anything."""
     from tqdm import tqdm
 
     tracked = lost = 0
-    with tqdm(range(len(sequence)), unit='frame', dynamic_ncols=True) as bar:
+    length = len(job.sequence)
+    with tqdm(range(job.first, length), initial=job.first, total=length, unit='frame', dynamic_ncols=True) as bar:
         for index in bar:
             if stop.requested:
                 break
             started_s = time.perf_counter()
             try:
-                frame = sequence[index]
+                frame = job.sequence[index]
                 decoded_s = time.perf_counter()
-                result = slam.process(frame)
+                result = job.slam.process(frame)
             except FrameError as error:
                 say(f'frame {index} is left out: {error}')
                 continue
             except DatasetError as error:
                 return error
-            folder.append(frame, result, time.perf_counter() - decoded_s, decoded_s - started_s)
+            job.folder.append(frame, result, time.perf_counter() - decoded_s, decoded_s - started_s)
+            job.checkpoints.after_frame(index, frame, job.slam)
             tracked, lost = tracked + (result.T_world_cam is not None), lost + (result.T_world_cam is None)
             bar.set_postfix(tracked=tracked, lost=lost, gaussians=result.num_gaussians, refresh=False)
     return None

@@ -35,3 +35,7 @@ class RasterizerError(SplatamError):
 
 class ExportError(SplatamError):
     """A map that cannot be brought into the form asked for."""
+
+
+class CheckpointError(SplatamError):
+    """A checkpoint that is missing, damaged, or of another run."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from splatam_core.rasterizer import Gaussians, Moments, Rates
@@ -12,6 +15,7 @@ from splatam_core.rasterizer.base import BETA_1, BETA_2, BLOCK, EPSILON
 from splatam_core.types import MapSnapshot
 
 PARAMETERS = ('means', 'log_scales', 'logit_opacities', 'rgb')
+BOUNDS = 'bounds'
 
 
 class GaussianMap:
@@ -127,6 +131,29 @@ class GaussianMap:
                 self.log_scales.numpy(force=True).copy(),
             )
 
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """A copy of all it holds between two optimisations, by name; ``restore`` takes it back."""
+        assert self._optimizer is None
+        arrays = {name: values[: self._size].numpy(force=True).copy() for name, values in self._room.items()}
+        return arrays | {BOUNDS: self._bounds.numpy(force=True).copy()}
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Hold what another map held, instead of what is here.
+
+        Raises:
+            ValueError: the arrays are not those of a map of this kind.
+        """
+        size = len(arrays['means']) if 'means' in arrays else 0
+        room = {name: values.new_empty(size, *values.shape[1:]) for name, values in self._room.items()}
+        bounds = self._bounds.new_empty(-(-size // BLOCK), *self._bounds.shape[1:])
+        expected = room | {BOUNDS: bounds}
+        if (found := _kinds(arrays)) != (wanted := _kinds({name: values.numpy(force=True) for name, values in expected.items()})):
+            raise ValueError(f'the map is {found}; expected {wanted}')
+        for name, values in expected.items():
+            values.copy_(torch.from_numpy(arrays[name]))
+        self._size, self._room, self._bounds, self._optimizer = size, room, bounds, None
+        self._show()
+
     def _show(self) -> None:
         """Let the parameters be the used part of the room, without gradients."""
         for name in PARAMETERS:
@@ -154,6 +181,10 @@ class GaussianMap:
             axis=1,
         )
         self._bounds = torch.cat([self._bounds[:first_block], torch.from_numpy(measured)])
+
+
+def _kinds(arrays: Mapping[str, NDArray[Any]]) -> dict[str, tuple[str, tuple[int, ...]]]:
+    return {name: (array.dtype.name, array.shape) for name, array in sorted(arrays.items())}
 
 
 def _replace_parameter(optimizer: torch.optim.Adam, old: Tensor, new: Tensor, kept: Tensor) -> None:

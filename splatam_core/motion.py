@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,24 @@ Matrix = NDArray[np.float64]
 # Pose [4, 4] of the camera at the second stamp (ns) in the camera at the first, by another sensor; None: not known.
 MotionPrior = Callable[[int, int], 'Matrix | None']
 CARRIED_ON = 5  # times the interval a velocity was seen over: after a longer gap nobody knows what the camera did meanwhile
+
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionState:
+    """What a motion model knows.
+
+    Attributes:
+        stamp_ns: of the last pose; 0 = at any time.
+        interval_ns: over which the velocity was seen.
+        T_world_cam: [4, 4] the last pose.
+        velocity: [6] twist per second, in the camera's frame.
+    """
+
+    stamp_ns: int
+    interval_ns: int
+    T_world_cam: Matrix
+    velocity: Matrix
 
 
 class MotionModel:
@@ -35,6 +54,21 @@ class MotionModel:
     def last_pose(self) -> Matrix:
         """[4, 4] camera to world."""
         return self._T_world_cam
+
+    def state(self) -> MotionState:
+        """All it knows; ``restore`` takes it back."""
+        return MotionState(self._stamp_ns, self._interval_ns, self._T_world_cam, self._velocity)
+
+    def restore(self, state: MotionState) -> None:
+        """Know what another one knew.
+
+        Raises:
+            ValueError: that is no pose and velocity.
+        """
+        if state.T_world_cam.shape != (4, 4) or state.velocity.shape != (6,):
+            raise ValueError(f'pose {state.T_world_cam.shape} and velocity {state.velocity.shape}: expected (4, 4) and (6,)')
+        self._stamp_ns, self._interval_ns = state.stamp_ns, state.interval_ns
+        self._T_world_cam, self._velocity = state.T_world_cam, state.velocity
 
     def predict(self, stamp_ns: int) -> Matrix:
         """[4, 4] camera to world at a stamp."""

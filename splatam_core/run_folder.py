@@ -10,6 +10,7 @@
     run.json         source, camera, commit, machine, versions
     report.png       drawn by the evaluation: one picture
     report.html      drawn by the evaluation: one page that needs nothing else
+    checkpoints/     to go on from, see checkpoints.py
     previous/        the same of before the map was last reset
 """
 
@@ -19,7 +20,8 @@ import csv
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -55,6 +57,7 @@ FILES = (TRAJECTORY, FRAMES, MAP, METRICS, CONFIG, RUN, REPORT, PAGE)
 CHECKPOINTS = 'checkpoints'
 PREVIOUS = 'previous'
 LOST = '# lost '
+KEEP_CHECKPOINTS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,11 +101,15 @@ class RunDescription:
         program: who ran it, ``splatam run`` or ``splatam_node``.
         preset: the preset it started from; None = the defaults.
         source: where its frames came from; None = live topics.
+        checkpoint_every: frames from one checkpoint to the next; None = none are written.
+        keep_checkpoints: how many are kept.
     """
 
     program: str
     preset: str | None = None
     source: Source | None = None
+    checkpoint_every: int | None = None
+    keep_checkpoints: int = KEEP_CHECKPOINTS
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,6 +189,11 @@ class RunFolder:
         """Whether no frame was written down yet."""
         return not self._records
 
+    @property
+    def num_frames(self) -> int:
+        """How many were written down."""
+        return len(self._records)
+
     def restarted(self, config: SlamConfig) -> RunFolder:
         """Begin anew in the same folder: another world, or another time. This object is closed.
 
@@ -239,6 +251,19 @@ class RunFolder:
         self._trajectory.flush()
         if len(self._records) == 1:
             self._write_camera(frame.camera)
+
+    def sync(self) -> None:
+        """Wait until what was written down would outlast a power cut."""
+        for file in (self._trajectory, self._frames):
+            file.flush()
+            os.fsync(file.fileno())
+
+    def note_resumption(self) -> None:
+        """Write into ``run.json`` that the run goes on after it was broken off, with which code."""
+        information = json.loads((self.path / RUN).read_text())
+        resumption = {'after_frames': self.num_frames, 'started': _now(), 'commit': environment.commit()}
+        information['resumed'] = [*information.get('resumed', []), resumption]
+        replace_text(self.path / RUN, _to_json(information))
 
     def save(self, slam: Slam) -> Metrics:
         """Write ``map.ply``, ``metrics.json`` and the settings as of now; may be called again later."""
@@ -401,21 +426,37 @@ def write_refined(run: RunRecord, path: Path, gaussians: Gaussians, iterations: 
         raise RunFolderError(f'{path}: cannot be written: {error.strerror}; choose another folder') from None
 
 
-def read_run(path: Path) -> RunRecord:
-    """Read a run's folder.
+@dataclass(frozen=True, slots=True)
+class RunSettings:
+    """What a run's folder says about the run as a whole.
+
+    Attributes:
+        path, config, description, camera, commit, machine, versions: as ``RunRecord`` has them.
+    """
+
+    path: Path
+    config: SlamConfig
+    description: RunDescription
+    camera: PinholeCamera | None
+    commit: str | None
+    machine: Mapping[str, str | int]
+    versions: Mapping[str, str | None]
+
+
+def read_settings(path: Path) -> RunSettings:
+    """Read what was written when a run began.
 
     Raises:
         RunFolderError: it is no run folder, or one of its files is damaged.
     """
-    if missing := [name for name in (TRAJECTORY, CONFIG, RUN) if not (path / name).is_file()]:
-        raise RunFolderError(f'{path} is no run folder: it has no {", ".join(missing)}')
-    try:
+    with _read_errors(path):
         information = json.loads((path / RUN).read_text())
         source, camera = information['source'], information['camera']
         description = RunDescription(
-            information['program'], information['preset'], None if source is None else Source(**source)
-        )
-        return RunRecord(
+            information['program'], information['preset'], None if source is None else Source(**source),
+            information.get('checkpoint_every'), information.get('keep_checkpoints', KEEP_CHECKPOINTS),
+        )  # fmt: skip
+        return RunSettings(
             path=path,
             config=load_config(str(path / CONFIG)),
             description=description,
@@ -423,13 +464,64 @@ def read_run(path: Path) -> RunRecord:
             commit=information['commit'],
             machine=information['machine'],
             versions=information['versions'],
+        )
+
+
+def read_run(path: Path) -> RunRecord:
+    """Read a run's folder.
+
+    Raises:
+        RunFolderError: it is no run folder, or one of its files is damaged.
+    """
+    settings = read_settings(path)
+    with _read_errors(path):
+        return RunRecord(
+            path=path,
+            config=settings.config,
+            description=settings.description,
+            camera=settings.camera,
+            commit=settings.commit,
+            machine=settings.machine,
+            versions=settings.versions,
             trajectory=read_trajectory(path / TRAJECTORY),
             lost_ns=_read_lost(path / TRAJECTORY),
             frames=_read_frames(path / FRAMES),
         )
+
+
+def trim_run(path: Path, num_frames: int, last_stamp_ns: int | None) -> None:
+    """Cut a run's folder back to its first frames: their lines stay; map, metrics and report of more are removed.
+
+    Args:
+        path: the folder.
+        num_frames: how many frames stay.
+        last_stamp_ns: stamp of the last of them.
+
+    Raises:
+        RunFolderError: that frame is not there; nothing is changed then.
+    """
+    with _read_errors(path):
+        trajectory = (path / TRAJECTORY).read_text().splitlines(keepends=True)[:num_frames]
+        frames = (path / FRAMES).read_text().splitlines(keepends=True)[: num_frames + 1]
+        for name, line in ((TRAJECTORY, trajectory[-1].removeprefix(LOST)), (FRAMES, frames[-1])):
+            found = stamp_from_text(line.replace(',', ' ').split()[0])
+            if found != last_stamp_ns or not line.endswith('\n'):
+                raise RunFolderError(f'{name} has frame {found} ns in line {num_frames}, expected {last_stamp_ns} ns')
+        for name in (MAP, METRICS, REPORT, PAGE):
+            (path / name).unlink(missing_ok=True)
+        replace_text(path / TRAJECTORY, ''.join(trajectory))
+        replace_text(path / FRAMES, ''.join(frames))
+
+
+@contextmanager
+def _read_errors(path: Path) -> Iterator[None]:
+    if missing := [name for name in (TRAJECTORY, CONFIG, RUN) if not (path / name).is_file()]:
+        raise RunFolderError(f'{path} is no run folder: it has no {", ".join(missing)}')
+    try:
+        yield
     except SplatamError as error:
         raise RunFolderError(f'{path} cannot be read: {error}') from None
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError, IndexError) as error:
         raise RunFolderError(f'{path} cannot be read: {error!r}; was it written by another version?') from None
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from splatam_core import se3
 from splatam_core.camera import PinholeCamera
+from splatam_core.checkpoints import SlamState
 from splatam_core.config import SlamConfig
 from splatam_core.densification import densify
 from splatam_core.errors import FrameError, SplatamError
@@ -96,6 +97,26 @@ class Slam:
         self.reset()
         self.map.append(gaussians)
         self._motion.place(T_world_cam)
+
+    def state(self) -> SlamState:
+        """All that the frames to come depend on; ``restore`` goes on from it, bit for bit."""
+        return SlamState(
+            self.config, self.camera, self.map.arrays(), tuple(self._keyframes), self._motion.state(),
+            dict(self._rng.bit_generator.state), self._scene_radius, self._num_frames, self._last_stamp_ns,
+        )  # fmt: skip
+
+    def restore(self, state: SlamState) -> None:
+        """Go on where another Slam of the same configuration was.
+
+        Raises:
+            ValueError: the state is not one of this configuration's.
+        """
+        self.reset()
+        self.map.restore(state.map)
+        self._motion.restore(state.motion)
+        self._rng.bit_generator.state = state.rng
+        self.camera, self._keyframes, self._scene_radius = state.camera, list(state.keyframes), state.scene_radius
+        self._num_frames, self._last_stamp_ns = state.num_frames, state.last_stamp_ns
 
     def rest(self) -> None:
         """Take the camera to be where it was last, at rest; the next frame may have any stamp."""

@@ -33,10 +33,11 @@ class Command:
     run: Callable[[argparse.Namespace], int]
 
 
-def add_source_arguments(parser: argparse.ArgumentParser) -> None:
+def add_source_arguments(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
     """SOURCE and how to read it."""
     parser.add_argument(
-        'source', metavar='SOURCE', help='dataset folder, bag (folder, .db3, .mcap, ROS 1 .bag), synthetic[:seed=0,...]'
+        'source', metavar='SOURCE', nargs='?' if optional else None,
+        help='dataset folder, bag (folder, .db3, .mcap, ROS 1 .bag), synthetic[:seed=0,...]'
     )
     parser.add_argument('--format', metavar='F', help='reader to use (default: guessed from SOURCE)')
     parser.add_argument('--start', type=int, default=0, metavar='N', help='leave out the first N frames')

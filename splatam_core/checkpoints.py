@@ -1,0 +1,236 @@
+"""Checkpoints: all that the frames to come depend on, so that a run that was broken off goes on as if it had not been.
+
+::
+
+    checkpoints/
+        000040.checkpoint     after 40 frames: map, optimiser, motion, random numbers, and which keyframes
+        000060.checkpoint     after 60
+        keyframes/
+            3f0c….keyframe    images and pose, named by their checksum: written once, shared by all checkpoints
+
+A checkpoint is written after its keyframes and in one step: whatever interrupts that, the one before is whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatam_core.camera import PinholeCamera
+from splatam_core.config import SlamConfig, flat_values, with_values
+from splatam_core.errors import CheckpointError, SplatamError
+from splatam_core.files import is_unfinished
+from splatam_core.keyframes import PosedView
+from splatam_core.motion import MotionState
+from splatam_core.sealed import Arrays, Content, seal, unseal
+from splatam_core.view import View
+
+VERSION = 1
+KIND, KEYFRAME = 'checkpoint', 'keyframe'
+KEYFRAMES = 'keyframes'
+_MAP = 'map.'
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlamState:
+    """All of ``Slam`` that the frames to come depend on.
+
+    Attributes:
+        config: every setting.
+        camera: of the frames; None before the first.
+        map: see ``GaussianMap.arrays``.
+        keyframes: as they were kept.
+        motion: of the motion model.
+        rng: of numpy's generator, as ``BitGenerator.state`` has it.
+        scene_radius: metres; 0 before the first frame.
+        num_frames: frames processed.
+        last_stamp_ns: stamp of the last one; None where the next may have any.
+    """
+
+    config: SlamConfig
+    camera: PinholeCamera | None
+    map: Arrays
+    keyframes: tuple[PosedView, ...]
+    motion: MotionState
+    rng: dict[str, Any]
+    scene_radius: float
+    num_frames: int
+    last_stamp_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a recording has been processed.
+
+    Attributes:
+        length: frames of the recording.
+        last_index: index of the last frame processed.
+        last_digest: of that frame, see ``resuming.frame_digest``.
+        num_lines: frames written down in the run's folder.
+    """
+
+    length: int
+    last_index: int
+    last_digest: str
+    num_lines: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Checkpoint:
+    """A checkpoint that was read.
+
+    Attributes:
+        path: the file.
+        state: of Slam.
+        progress: in the recording.
+    """
+
+    path: Path
+    state: SlamState
+    progress: Progress
+
+
+class Checkpoints:
+    """Writes the checkpoints of one run. Not for several at once."""
+
+    def __init__(self, folder: Path, keep: int) -> None:
+        """Write nothing yet.
+
+        Args:
+            folder: the run's ``checkpoints/``.
+            keep: how many to keep; older ones are removed.
+        """
+        self._folder = folder
+        self._keep = keep
+        self._written: list[tuple[PosedView, str]] = []
+
+    def save(self, state: SlamState, progress: Progress) -> Path:
+        """Write a checkpoint, then remove what is too old. Returns the new file's path.
+
+        Raises:
+            OSError: it cannot be written; the checkpoints that are there stay.
+        """
+        (self._folder / KEYFRAMES).mkdir(parents=True, exist_ok=True)
+        digests = [self._write_keyframe(index, keyframe) for index, keyframe in enumerate(state.keyframes)]
+        path = self._folder / f'{progress.num_lines:06d}.{KIND}'
+        seal(KIND, VERSION, _pack(state, progress, digests)).write(path)
+        self._remove_old(set(digests))
+        return path
+
+    def _write_keyframe(self, index: int, keyframe: PosedView) -> str:
+        if index < len(self._written) and self._written[index][0] is keyframe:
+            return self._written[index][1]
+        arrays = {
+            'rgb8': keyframe.view.rgb8.numpy(force=True), 'depth': keyframe.view.depth.numpy(force=True),
+            'T_cam_world': keyframe.T_cam_world.numpy(force=True),
+        }  # fmt: skip
+        file = seal(KEYFRAME, VERSION, Content({}, arrays))
+        file.write(_keyframe_path(self._folder, file.digest))
+        self._written[index:] = [(keyframe, file.digest)]
+        return file.digest
+
+    def _remove_old(self, digests: set[str]) -> None:
+        """Older checkpoints of a run refer to no keyframe that the newest does not."""
+        for path in checkpoint_paths(self._folder)[: -self._keep]:
+            path.unlink(missing_ok=True)
+        for path in (self._folder / KEYFRAMES).glob(f'*.{KEYFRAME}'):
+            if path.stem not in digests:
+                path.unlink(missing_ok=True)
+        for path in list(_unfinished(self._folder)):
+            path.unlink(missing_ok=True)
+
+
+def checkpoint_paths(folder: Path) -> list[Path]:
+    """The checkpoints in a run's ``checkpoints/``, the newest last."""
+    paths = (path for path in folder.glob(f'*.{KIND}') if path.stem.isdecimal())
+    return sorted(paths, key=lambda path: int(path.stem))
+
+
+def read_newest(folder: Path) -> Checkpoint:
+    """Read the newest checkpoint in a run's ``checkpoints/``.
+
+    Raises:
+        CheckpointError: there is none, or it cannot be used.
+    """
+    paths = checkpoint_paths(folder)
+    if not paths:
+        raise CheckpointError(f"{folder} holds no checkpoint: run with '--checkpoint-every N' to have some")
+    try:
+        return read_checkpoint(paths[-1])
+    except CheckpointError as error:
+        way_out = f'to go on from {paths[-2].name}' if len(paths) > 1 else 'and start anew: it is the only one'
+        raise CheckpointError(f'{error}; move {paths[-1].name} away {way_out}') from None
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint and its keyframes.
+
+    Raises:
+        CheckpointError: one of the files is missing, damaged, of another version or no checkpoint.
+    """
+    content = unseal(path, KIND, VERSION)
+    try:
+        return _unpack(path, content)
+    except CheckpointError:
+        raise
+    except (KeyError, TypeError, ValueError, SplatamError) as error:
+        raise CheckpointError(f'{path}: is no checkpoint that this version understands: {error!r}') from None
+
+
+def _pack(state: SlamState, progress: Progress, digests: Sequence[str]) -> Content:
+    motion = state.motion
+    values = {
+        'config': flat_values(state.config), 'camera': None if state.camera is None else asdict(state.camera),
+        'keyframes': list(digests), 'rng': state.rng, 'scene_radius': state.scene_radius, 'num_frames': state.num_frames,
+        'last_stamp_ns': state.last_stamp_ns, 'progress': asdict(progress),
+        'motion_ns': [motion.stamp_ns, motion.interval_ns],
+    }  # fmt: skip
+    arrays = {_MAP + name: array for name, array in state.map.items()}
+    return Content(values, arrays | {'T_world_cam': motion.T_world_cam, 'velocity': motion.velocity})
+
+
+def _unpack(path: Path, content: Content) -> Checkpoint:
+    values, arrays = content.values, content.arrays
+    camera = None if values['camera'] is None else PinholeCamera(**values['camera'])
+    stamp_ns, interval_ns = values['motion_ns']
+    state = SlamState(
+        config=with_values(SlamConfig(), values['config']),
+        camera=camera,
+        map={name.removeprefix(_MAP): array for name, array in arrays.items() if name.startswith(_MAP)},
+        keyframes=tuple(_read_keyframe(path.parent, digest, camera) for digest in values['keyframes']),
+        motion=MotionState(stamp_ns, interval_ns, arrays['T_world_cam'], arrays['velocity']),
+        rng=values['rng'],
+        scene_radius=values['scene_radius'],
+        num_frames=values['num_frames'],
+        last_stamp_ns=values['last_stamp_ns'],
+    )
+    return Checkpoint(path, state, Progress(**values['progress']))
+
+
+def _read_keyframe(folder: Path, digest: str, camera: PinholeCamera | None) -> PosedView:
+    path = _keyframe_path(folder, digest)
+    if camera is None:
+        raise CheckpointError(f'{path}: is no keyframe of this run, which has no camera')
+    arrays = unseal(path, KEYFRAME, VERSION, digest).arrays
+    size = (camera.height, camera.width)
+    rgb8, depth, T_cam_world = (arrays[name] for name in ('rgb8', 'depth', 'T_cam_world'))
+    expected = [('uint8', (*size, 3)), ('float32', size), ('float32', (4, 4))]
+    found = [(array.dtype.name, array.shape) for array in (rgb8, depth, T_cam_world)]
+    if found != expected:
+        raise CheckpointError(f'{path}: is no keyframe of this run: it holds {found}, expected {expected}')
+    return PosedView(View(camera, torch.from_numpy(rgb8), torch.from_numpy(depth)), torch.from_numpy(T_cam_world))
+
+
+def _keyframe_path(folder: Path, digest: str) -> Path:
+    return folder / KEYFRAMES / f'{digest}.{KEYFRAME}'
+
+
+def _unfinished(folder: Path) -> Iterator[Path]:
+    """What was left by a process that was killed while it wrote."""
+    for path in (*folder.glob(f'.*.{KIND}.*'), *folder.glob(f'{KEYFRAMES}/.*.{KEYFRAME}.*')):
+        if is_unfinished(path.name, (path.name.removeprefix('.').rpartition('.')[0],)):
+            yield path

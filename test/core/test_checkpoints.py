@@ -1,0 +1,546 @@
+"""Checkpoints: a run that was broken off ends as if it had not been; what is damaged is refused, nothing in it is executed."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import pickle
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from splatam_core import checkpoints, cli, resuming
+from splatam_core.checkpoints import Checkpoints, Progress, SlamState, checkpoint_paths, read_checkpoint, read_newest
+from splatam_core.config import load_config
+from splatam_core.datasets.registry import open_sequence
+from splatam_core.errors import CheckpointError
+from splatam_core.run_folder import read_run
+from splatam_core.sealed import Content, seal, unseal
+from splatam_core.slam import Slam
+
+ROOT = Path(__file__).resolve().parents[2]
+WIDTH, FRAMES, EVERY = 64, 8, 3
+SOURCE = ['synthetic:noise=off', '--width', str(WIDTH), '--max-frames', str(FRAMES)]
+PRESETS = ('quick', 'splatam', 'realtime')
+FAST = ['threads=1', 'mapping.iterations=6', 'keyframes.every=2', 'keyframes.window=3']
+ITERATIONS = {'quick': 6, 'splatam': 8, 'realtime': 6}
+MEASURED = {'fps', 'fps_with_io', 'timings_ms', 'peak_rss_mb'}  # times, and the memory of one process
+PROGRESS = Progress(FRAMES, 3, '0' * 64, 4)
+
+
+def settings(preset: str) -> list[str]:
+    return [*FAST, f'tracking.iterations={ITERATIONS[preset]}']
+
+
+def arguments(preset: str, out: Path, *more: object) -> list[str]:
+    changed = [word for setting in settings(preset) for word in ('--set', setting)]
+    return ['run', *SOURCE, '--preset', preset, *changed, '--no-evaluate', '--out', str(out), *map(str, more)]
+
+
+def splatam(*words: object) -> int:
+    return cli.main([str(word) for word in words])
+
+
+def start(code: str, *words: object) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, '-c', textwrap.dedent(code), *map(str, words)],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+
+
+def result(folder: Path) -> tuple[bytes, bytes, dict[str, object]]:
+    metrics = json.loads((folder / 'metrics.json').read_text())
+    kept = {name: value for name, value in metrics.items() if name not in MEASURED}
+    return (folder / 'trajectory.txt').read_bytes(), (folder / 'map.ply').read_bytes(), kept
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob('*') if path.is_file()}
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Runs without checkpoints or interruption, by preset; not to be changed."""
+    folder = tmp_path_factory.mktemp('whole')
+    for preset in PRESETS:
+        assert splatam(*arguments(preset, folder / preset)) == 0
+    return {preset: folder / preset for preset in PRESETS}
+
+
+@pytest.fixture(scope='module')
+def broken_off(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a run leaves that was killed one frame after its second checkpoint; not to be changed."""
+    folder = tmp_path_factory.mktemp('killed') / 'run'
+    killed_after(7, arguments('quick', folder, '--checkpoint-every', EVERY))
+    return folder
+
+
+@pytest.fixture
+def run(broken_off: Path, tmp_path: Path) -> Path:
+    """The same, to be changed."""
+    return Path(shutil.copytree(broken_off, tmp_path / 'run'))
+
+
+@pytest.fixture(scope='module')
+def state() -> SlamState:
+    """Of Slam after four frames."""
+    slam, frames = Slam(load_config('quick', settings('quick'))), open_sequence(SOURCE[0], width=WIDTH, max_frames=4)
+    for index in range(len(frames)):
+        slam.process(frames[index])
+    return slam.state()
+
+
+def killed_after(frames: int, words: list[str]) -> None:
+    """Run the command line in a process that is killed once so many frames are written down."""
+    code = """
+        import os, signal, sys
+        from splatam_core import cli
+        from splatam_core.run_folder import RunFolder
+
+        append = RunFolder.append
+
+        def append_and_die(folder, *arguments):
+            append(folder, *arguments)
+            if folder.num_frames == int(sys.argv[1]):
+                os.kill(os.getpid(), signal.SIGKILL)
+
+        RunFolder.append = append_and_die
+        sys.exit(cli.main(sys.argv[2:]))
+    """
+    process = start(code, frames, *words)
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == -signal.SIGKILL, output
+
+
+# --- going on ---
+
+
+@pytest.mark.parametrize('preset', PRESETS)
+def test_a_run_that_was_killed_ends_as_if_it_had_not_been(preset: str, whole: dict[str, Path], tmp_path: Path) -> None:
+    killed_after(5, arguments(preset, tmp_path / 'run', '--checkpoint-every', EVERY))
+    assert len((tmp_path / 'run' / 'trajectory.txt').read_text().splitlines()) == 5  # two after the checkpoint
+    assert splatam('run', '--resume', tmp_path / 'run', '--no-evaluate') == 0
+    assert result(tmp_path / 'run') == result(whole[preset])
+    assert len(read_run(whole[preset]).trajectory) >= FRAMES - 2  # they would agree on lost frames, too
+    assert len(read_run(tmp_path / 'run').frames) == FRAMES
+
+
+def test_writing_checkpoints_changes_nothing(whole: dict[str, Path], tmp_path: Path) -> None:
+    assert splatam(*arguments('quick', tmp_path / 'run', '--checkpoint-every', EVERY)) == 0
+    assert result(tmp_path / 'run') == result(whole['quick'])
+    assert [path.name for path in checkpoint_paths(tmp_path / 'run' / 'checkpoints')] == [
+        '000003.checkpoint', '000006.checkpoint',
+    ]  # fmt: skip
+
+
+def test_killed_and_resumed_time_and_again(whole: dict[str, Path], tmp_path: Path) -> None:
+    killed_after(4, arguments('quick', tmp_path / 'run', '--checkpoint-every', 2, '--keep-checkpoints', 1))
+    killed_after(7, ['run', '--resume', str(tmp_path / 'run'), '--no-evaluate'])
+    folder = tmp_path / 'run' / 'checkpoints'
+    assert [path.name for path in checkpoint_paths(folder)] == ['000006.checkpoint']  # both switches are remembered
+    assert splatam('run', '--resume', tmp_path / 'run', '--no-evaluate') == 0
+    assert result(tmp_path / 'run') == result(whole['quick'])
+    resumed = json.loads((tmp_path / 'run' / 'run.json').read_text())['resumed']
+    assert [entry['after_frames'] for entry in resumed] == [2, 6]
+
+
+def test_ctrl_c_saves_a_checkpoint_of_the_last_frame(
+    whole: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    after_frame = resuming.CheckpointWriter.after_frame
+
+    def interrupted(writer: resuming.CheckpointWriter, index: int, *others: object) -> None:
+        after_frame(writer, index, *others)
+        if index == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(resuming.CheckpointWriter, 'after_frame', interrupted)
+        assert splatam(*arguments('quick', tmp_path / 'run', '--checkpoint-every', EVERY)) == cli.EXIT_INTERRUPTED
+    assert f"'splatam run --resume {tmp_path / 'run'}' goes on" in capsys.readouterr().err
+    assert read_newest(tmp_path / 'run' / 'checkpoints').progress.num_lines == 4
+    assert splatam('run', '--resume', tmp_path / 'run', '--no-evaluate') == 0
+    assert result(tmp_path / 'run') == result(whole['quick'])
+
+
+def test_a_finished_run_may_be_resumed(whole: dict[str, Path], tmp_path: Path) -> None:
+    assert splatam(*arguments('quick', tmp_path / 'run', '--checkpoint-every', EVERY)) == 0
+    assert splatam('run', '--resume', tmp_path / 'run', '--no-evaluate') == 0
+    assert result(tmp_path / 'run') == result(whole['quick'])
+
+
+def test_the_last_line_may_be_cut_off(run: Path, whole: dict[str, Path]) -> None:
+    for name in ('trajectory.txt', 'frames.csv'):
+        os.truncate(run / name, (run / name).stat().st_size - 5)
+    assert splatam('run', '--resume', run, '--no-evaluate') == 0
+    assert result(run) == result(whole['quick'])
+
+
+def test_map_and_scores_of_frames_to_be_redone_are_removed(run: Path) -> None:
+    for name in ('map.ply', 'metrics.json', 'report.png'):
+        (run / name).write_text('of more frames')
+    resuming.resume(run, open_source, lambda config: None, lambda text: None).folder.close()
+    assert not any((run / name).exists() for name in ('map.ply', 'metrics.json', 'report.png'))
+    assert len(read_run(run).frames) == len((run / 'trajectory.txt').read_text().splitlines()) == 6
+
+
+# --- state ---
+
+
+def test_state_is_read_back_as_it_was(state: SlamState, tmp_path: Path) -> None:
+    path = Checkpoints(tmp_path, 2).save(state, PROGRESS)
+    read = read_checkpoint(path)
+    assert read.progress == PROGRESS
+    for name in ('config', 'camera', 'rng', 'scene_radius', 'num_frames', 'last_stamp_ns'):
+        assert getattr(read.state, name) == getattr(state, name), name
+    assert state.map.keys() == read.state.map.keys() >= {'means', 'rgb', 'first_second', 'steps', 'bounds'}
+    for name, array in state.map.items():
+        np.testing.assert_array_equal(read.state.map[name], array, strict=True)
+    assert len(read.state.keyframes) == len(state.keyframes) == 2
+    for ours, theirs in zip(read.state.keyframes, state.keyframes):
+        assert all((getattr(ours.view, name) == getattr(theirs.view, name)).all() for name in ('rgb8', 'depth'))
+        assert (ours.T_cam_world == theirs.T_cam_world).all() and ours.view.camera == theirs.view.camera
+    np.testing.assert_array_equal(read.state.motion.T_world_cam, state.motion.T_world_cam, strict=True)
+    np.testing.assert_array_equal(read.state.motion.velocity, state.motion.velocity, strict=True)
+
+
+def test_state_is_a_copy(state: SlamState) -> None:
+    """What is saved must not change with the frames processed after."""
+    slam, frames = Slam(state.config), open_sequence(SOURCE[0], width=WIDTH, max_frames=6)
+    slam.restore(state)
+    before = slam.state()
+    means, rng = before.map['means'].copy(), json.dumps(before.rng)
+    slam.process(frames[4])
+    assert not np.array_equal(slam.state().map['means'][: len(means)], means)
+    np.testing.assert_array_equal(before.map['means'], means)
+    assert (json.dumps(before.rng), len(before.keyframes)) == (rng, 2) and json.dumps(slam.state().rng) != rng
+
+
+def test_a_state_of_another_kind_of_map_is_refused(state: SlamState) -> None:
+    slam = Slam(state.config)
+    with pytest.raises(ValueError, match=r'rgb.*expected'):
+        slam.restore(replace(state, map={**state.map, 'rgb': state.map['rgb'][:-1]}))
+
+
+# --- files ---
+
+
+def test_keyframes_are_written_once_and_removed_with_the_last_checkpoint_that_has_them(
+    state: SlamState, tmp_path: Path
+) -> None:
+    writer = Checkpoints(tmp_path, 2)
+    writer.save(replace(state, keyframes=state.keyframes[:1]), PROGRESS)
+    first = {path: path.stat().st_mtime_ns for path in (tmp_path / 'keyframes').iterdir()}
+    writer.save(state, replace(PROGRESS, num_lines=5))
+    both = {path: path.stat().st_mtime_ns for path in (tmp_path / 'keyframes').iterdir()}
+    assert len(first) == 1 and len(both) == 2 and first.items() <= both.items()
+    writer.save(replace(state, keyframes=()), replace(PROGRESS, num_lines=6))
+    assert not any((tmp_path / 'keyframes').iterdir())
+
+
+def test_only_the_last_ones_are_kept(state: SlamState, tmp_path: Path) -> None:
+    writer = Checkpoints(tmp_path, 3)
+    for lines in range(999_997, 1_000_002):
+        writer.save(state, replace(PROGRESS, num_lines=lines))
+    assert [path.stem for path in checkpoint_paths(tmp_path)] == ['999999', '1000000', '1000001']
+    assert read_newest(tmp_path).progress.num_lines == 1_000_001
+
+
+def test_a_process_killed_while_saving_leaves_the_checkpoint_before(state: SlamState, tmp_path: Path) -> None:
+    """At every place where it waits for the disk, as the file's bytes are written but it has no name yet."""
+    path = Checkpoints(tmp_path, 1).save(state, PROGRESS)
+    before = path.read_bytes()
+    code = """
+        import os, signal, sys
+        from dataclasses import replace
+        from pathlib import Path
+        from splatam_core.checkpoints import Checkpoints, read_newest
+
+        countdown, fsync = int(sys.argv[2]), os.fsync
+
+        def fsync_or_die(file):
+            global countdown
+            if not countdown:
+                os.kill(os.getpid(), signal.SIGKILL)
+            countdown -= 1
+            fsync(file)
+
+        os.fsync = fsync_or_die
+        old = read_newest(Path(sys.argv[1]))
+        Checkpoints(Path(sys.argv[1]), 1).save(old.state, replace(old.progress, num_lines=99))
+    """
+    killed = [start(code, tmp_path, files) for files in range(len(state.keyframes) + 1)]
+    for process in killed:
+        output, _ = process.communicate(timeout=120)
+        assert process.returncode == -signal.SIGKILL, output
+    assert list(tmp_path.rglob('.*')), 'nothing was being written'
+    assert path.read_bytes() == before and read_newest(tmp_path).progress == PROGRESS
+    Checkpoints(tmp_path, 1).save(state, PROGRESS)
+    assert not list(tmp_path.rglob('.*')), 'what the killed ones left is still there'
+
+
+def test_a_process_killed_anywhere_while_saving_leaves_a_checkpoint(state: SlamState, tmp_path: Path) -> None:
+    Checkpoints(tmp_path, 2).save(state, PROGRESS)
+    code = """
+        import sys
+        from dataclasses import replace
+        from pathlib import Path
+        from splatam_core.checkpoints import Checkpoints, read_newest
+
+        old = read_newest(Path(sys.argv[1]))
+        print('ready', flush=True)
+        while True:
+            old = read_newest(Path(sys.argv[1]))
+            Checkpoints(Path(sys.argv[1]), 2).save(old.state, replace(old.progress, num_lines=old.progress.num_lines + 1))
+    """
+    for wait_s in (0.05, 0.13, 0.21):
+        process = start(code, tmp_path)
+        assert process.stdout is not None and process.stdout.readline() == 'ready\n'
+        time.sleep(wait_s)
+        process.kill()
+        process.communicate(timeout=60)
+        assert read_newest(tmp_path).state.num_frames == state.num_frames
+    assert read_newest(tmp_path).progress.num_lines > PROGRESS.num_lines
+
+
+@contextmanager
+def file_size_limit(num_bytes: int) -> Iterator[None]:
+    """Writing a file beyond this fails, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_disk_that_is_full_does_not_stop_slam(
+    whole: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save = Checkpoints.save
+
+    def save_where_little_fits(writer: Checkpoints, state: SlamState, progress: Progress) -> Path:
+        if progress.num_lines < FRAMES - 1:
+            with file_size_limit(4096):
+                return save(writer, state, progress)
+        return save(writer, state, progress)
+
+    monkeypatch.setattr(Checkpoints, 'save', save_where_little_fits)
+    assert splatam(*arguments('quick', tmp_path / 'run', '--checkpoint-every', 1)) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if 'no checkpoint after frame' in line]
+    assert len(said) == FRAMES - 2 and all('File too large; going on' in line for line in said)
+    assert result(tmp_path / 'run') == result(whole['quick'])
+    assert len(checkpoint_paths(tmp_path / 'run' / 'checkpoints')) == 2  # once there was room
+    assert not [path for path in (tmp_path / 'run').rglob('.*')]
+
+
+# --- what is refused ---
+
+
+def refused(run: Path, capsys: pytest.CaptureFixture[str], *more: object) -> str:
+    """The one line that says why a run is not resumed, and changes nothing."""
+    before = tree(run)
+    assert splatam('run', '--resume', run, *more) == cli.EXIT_ERROR
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith('splatam: error: ')]
+    assert len(lines) == 1
+    assert tree(run) == before
+    return lines[0]
+
+
+def test_truncated_files_are_refused(state: SlamState, tmp_path: Path) -> None:
+    path = Checkpoints(tmp_path, 1).save(state, PROGRESS)
+    data = path.read_bytes()
+    for size in (*range(0, 140), *range(140, len(data), len(data) // 60), len(data) - 1):
+        path.write_bytes(data[:size])
+        with pytest.raises(CheckpointError, match='000004.checkpoint: .*damaged'):
+            read_newest(tmp_path)
+    path.write_bytes(data + b'\0')
+    with pytest.raises(CheckpointError, match='damaged'):
+        read_newest(tmp_path)
+
+
+def test_changed_bytes_are_refused(state: SlamState, tmp_path: Path) -> None:
+    path = Checkpoints(tmp_path, 1).save(state, PROGRESS)
+    data = path.read_bytes()
+    rng = np.random.default_rng(0)
+    for offset in (*range(0, 140), *rng.integers(len(data), size=60)):
+        changed = bytearray(data)
+        changed[offset] ^= 1 << int(rng.integers(8))
+        path.write_bytes(changed)
+        with pytest.raises(CheckpointError, match='000004.checkpoint: is (damaged|no checkpoint|of format)'):
+            read_newest(tmp_path)
+
+
+@pytest.mark.parametrize('damage', ['missing', 'cut off', 'changed', 'of another run'])
+def test_damaged_keyframes_are_refused(damage: str, run: Path, state: SlamState, capsys: pytest.CaptureFixture[str]) -> None:
+    path = next(path for path in (run / 'checkpoints' / 'keyframes').iterdir())
+    data = path.read_bytes()
+    if damage == 'missing':
+        path.unlink()
+    elif damage == 'cut off':
+        path.write_bytes(data[: len(data) // 2])
+    elif damage == 'changed':
+        path.write_bytes(data[:-9] + bytes([data[-9] ^ 1]) + data[-8:])
+    else:
+        seal('keyframe', 1, Content({}, {'rgb8': np.zeros(3)})).write(path)
+    expected = {'missing': 'No such file', 'of another run': 'not the file that belongs here'}.get(damage, 'is damaged')
+    line = refused(run, capsys)
+    assert path.name in line and expected in line and 'move 000006.checkpoint away' in line
+
+
+def test_the_error_shows_a_way_out_that_works(
+    run: Path, whole: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    newest = run / 'checkpoints' / '000006.checkpoint'
+    newest.write_bytes(newest.read_bytes()[:-100])
+    assert 'move 000006.checkpoint away to go on from 000003.checkpoint' in refused(run, capsys)
+    newest.rename(newest.with_suffix('.damaged'))
+    assert splatam('run', '--resume', run, '--no-evaluate') == 0
+    assert result(run) == result(whole['quick'])
+
+
+class Executes:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Path.touch, (self.path,)
+
+
+def sealed(payload: bytes, header: str = 'splatam_ros checkpoint 1') -> bytes:
+    return f'{header} {hashlib.sha256(payload).hexdigest()}\n'.encode() + payload
+
+
+def test_nothing_in_a_checkpoint_is_executed(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    newest, trap = run / 'checkpoints' / '000006.checkpoint', tmp_path / 'executed'
+    objects = io.BytesIO()
+    np.savez(objects, allow_pickle=True, means=np.array([Executes(trap)], dtype=object))
+    bare = io.BytesIO()
+    np.save(bare, np.array([Executes(trap)], dtype=object), allow_pickle=True)
+    for payload in (objects.getvalue(), bare.getvalue(), pickle.dumps(Executes(trap))):
+        newest.write_bytes(sealed(payload))
+        assert 'something else than arrays of numbers' in refused(run, capsys)
+    newest.write_bytes(pickle.dumps(Executes(trap)))
+    assert 'is no checkpoint of splatam_ros' in refused(run, capsys)
+    assert not trap.exists()
+    np.load(io.BytesIO(objects.getvalue()), allow_pickle=True)['means']
+    assert trap.exists(), 'the trap does not work'
+
+
+def test_other_files_are_refused(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    newest = run / 'checkpoints' / '000006.checkpoint'
+    payload = newest.read_bytes().split(b'\n', 1)[1]
+    newest.write_bytes(sealed(payload, 'splatam_ros checkpoint 2'))
+    assert "is of format '2' and this version reads format 1" in refused(run, capsys)
+    newest.write_bytes(next((run / 'checkpoints' / 'keyframes').iterdir()).read_bytes())
+    assert 'is no checkpoint of splatam_ros' in refused(run, capsys)
+    newest.write_bytes(b'\x89PNG\r\n\x1a\n' + bytes(100))
+    assert r"begins with b'\x89PNG\r" in refused(run, capsys)
+    newest.write_bytes(sealed(b''))
+    assert 'something else than arrays' in refused(run, capsys)
+
+
+def test_sealed_but_senseless_content_is_refused(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Whoever computes the checksum may write what they like; it must still be a checkpoint."""
+    newest = run / 'checkpoints' / '000006.checkpoint'
+    content = unseal(newest, 'checkpoint', 1)
+    for values, arrays in (
+        ({'rng': {}}, {}),
+        ({'rng': {'bit_generator': 'PCG64', 'state': 3}}, {}),
+        ({'config': {'no.such.key': 1}}, {}),
+        ({'camera': None}, {}),
+        ({'camera': {'width': 64}}, {}),
+        ({'motion_ns': [1]}, {}),
+        ({'progress': {}}, {}),
+        ({}, {'velocity': np.zeros(7)}),
+        ({}, {'map.means': np.zeros((3, 3))}),
+        ({}, {'map.steps': content.arrays['map.steps'].astype(np.float32)}),
+    ):
+        seal('checkpoint', 1, Content({**content.values, **values}, {**content.arrays, **arrays})).write(newest)
+        assert '000006.checkpoint' in refused(run, capsys) or 'keyframe' in refused(run, capsys)
+
+
+def test_other_settings_are_refused(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = yaml.safe_load((run / 'config.yaml').read_text())
+    config['mapping']['iterations'] += 1
+    (run / 'config.yaml').write_text(yaml.safe_dump(config))
+    assert 'mapping.iterations = 7 (was 6)' in refused(run, capsys)
+
+
+@pytest.mark.parametrize(
+    ('changed', 'said'),
+    [
+        ({'max_frames': FRAMES + 1}, f'has {FRAMES + 1} frames; it had {FRAMES}'),
+        ({'width': 2 * WIDTH}, 'is of PinholeCamera'),
+        ({'path': 'synthetic:noise=off,seed=1'}, 'has another frame 5'),
+        ({'start': 1}, 'has another frame 5'),
+        ({'path': '/nowhere'}, '/nowhere'),
+    ],
+)
+def test_other_frames_are_refused(
+    changed: dict[str, object], said: str, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    information = json.loads((run / 'run.json').read_text())
+    information['source'] |= changed
+    (run / 'run.json').write_text(json.dumps(information))
+    assert said in refused(run, capsys)
+
+
+def test_a_trajectory_that_is_not_the_checkpoint_s_is_refused(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = (run / 'trajectory.txt').read_text().splitlines(keepends=True)
+    (run / 'trajectory.txt').write_text(''.join(lines[1:]))
+    assert 'trajectory.txt has frame' in refused(run, capsys)
+    (run / 'trajectory.txt').write_text(''.join(lines[:4]))
+    assert 'trajectory.txt has frame' in refused(run, capsys)
+
+
+def test_what_cannot_be_resumed_is_said(
+    run: Path, whole: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert 'is no run folder' in refused(tmp_path / 'nothing', capsys)
+    assert "run with '--checkpoint-every N'" in refused(whole['quick'], capsys)
+    assert 'leave out --preset' in refused(run, capsys, '--preset', 'quick')
+    assert 'leave out SOURCE, --max-frames, --out' in refused(run, capsys, 'synthetic', '--max-frames', 3, '--out', run)
+    with pytest.raises(SystemExit):
+        splatam('run', 'synthetic')
+    assert '--out DIR, or --resume DIR' in capsys.readouterr().err
+    information = json.loads((run / 'run.json').read_text())
+    (run / 'run.json').write_text(json.dumps(information | {'source': None}))
+    assert 'live topics' in refused(run, capsys)
+
+
+def test_other_code_is_said(run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(resuming.environment, 'commit', lambda: 'another')
+    assert splatam('run', '--resume', run, '--no-evaluate') == 0
+    assert 'goes on by another: the result may differ' in capsys.readouterr().err
+
+
+def test_a_sealed_file_is_the_same_whenever_it_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    content = Content({'a': 1.5}, {'b': np.arange(3)})
+    first = seal('checkpoint', 1, content)
+    monkeypatch.setattr(time, 'localtime', lambda *_: time.gmtime(2e9))  # an archive has dates
+    again = seal('checkpoint', 1, content)
+    assert (first.header, bytes(first.payload)) == (again.header, bytes(again.payload))
+
+
+def test_the_module_s_promise_that_numpy_alone_reads_it(state: SlamState, tmp_path: Path) -> None:
+    path = Checkpoints(tmp_path, 1).save(state, PROGRESS)
+    with np.load(io.BytesIO(path.read_bytes().split(b'\n', 1)[1])) as archive:
+        np.testing.assert_array_equal(archive['map.means'], state.map['means'])
+    assert checkpoints.VERSION == 1
