@@ -147,7 +147,8 @@ class GaussianMap:
         room = {name: values.new_empty(size, *values.shape[1:]) for name, values in self._room.items()}
         bounds = self._bounds.new_empty(-(-size // BLOCK), *self._bounds.shape[1:])
         expected = room | {BOUNDS: bounds}
-        if (found := _kinds(arrays)) != (wanted := _kinds({name: values.numpy(force=True) for name, values in expected.items()})):
+        found, wanted = _kinds(arrays), _kinds({name: values.numpy(force=True) for name, values in expected.items()})
+        if found != wanted:
             raise ValueError(f'the map is {found}; expected {wanted}')
         for name, values in expected.items():
             values.copy_(torch.from_numpy(arrays[name]))

@@ -66,7 +66,8 @@ class MotionModel:
             ValueError: that is no pose and velocity.
         """
         if state.T_world_cam.shape != (4, 4) or state.velocity.shape != (6,):
-            raise ValueError(f'pose {state.T_world_cam.shape} and velocity {state.velocity.shape}: expected (4, 4) and (6,)')
+            shapes = f'pose {state.T_world_cam.shape} and velocity {state.velocity.shape}'
+            raise ValueError(f'{shapes}: expected (4, 4) and (6,)')
         self._stamp_ns, self._interval_ns = state.stamp_ns, state.interval_ns
         self._T_world_cam, self._velocity = state.T_world_cam, state.velocity
 

@@ -1,4 +1,4 @@
-"""Checkpoints: a run that was broken off ends as if it had not been; what is damaged is refused, nothing in it is executed."""
+"""Checkpoints: a run that was broken off ends as if it had not been; what is damaged is refused, nothing executed."""
 
 from __future__ import annotations
 
@@ -386,7 +386,7 @@ def test_changed_bytes_are_refused(state: SlamState, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('damage', ['missing', 'cut off', 'changed', 'of another run'])
-def test_damaged_keyframes_are_refused(damage: str, run: Path, state: SlamState, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damaged_keyframes_are_refused(damage: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = next(path for path in (run / 'checkpoints' / 'keyframes').iterdir())
     data = path.read_bytes()
     if damage == 'missing':
