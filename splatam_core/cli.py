@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING
@@ -68,6 +69,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         '--holdout', type=positive, metavar='N',
         help='track every n-th frame, but keep it out of the map to score it on; the same as --set mapping.hold_out=N',
     )  # fmt: skip
+    parser.add_argument(
         '--checkpoint-every', type=positive, metavar='N', help='save all that --resume needs after every n-th frame'
     )
     parser.add_argument(

@@ -25,6 +25,7 @@ import yaml
 
 from splatam_core import checkpoints, cli, resuming
 from splatam_core.checkpoints import Checkpoints, Progress, SlamState, checkpoint_paths, read_checkpoint, read_newest
+from splatam_core.commands.shared import open_source
 from splatam_core.config import load_config
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.errors import CheckpointError
