@@ -89,15 +89,19 @@ def run(args: argparse.Namespace) -> int:
     from splatam_core.config import apply_threads, load_config
     from splatam_core.run_folder import RunDescription, RunFolder, read_run
     from splatam_core.slam import Slam
+    from splatam_core.truth import FramesWithTruth
 
     config = load_config(args.preset, args.set)
     apply_threads(config)
     source = _source(args)
     sequence = _open(source)
+    if config.tracking.method == 'truth':
+        sequence = FramesWithTruth(sequence)
     description = RunDescription('splatam run', args.preset, source)
     folder = RunFolder.create(args.out, config, description, overwrite=args.overwrite)
     with folder, _StopRequest() as stop:
-        slam = Slam(config)
+        true_motion = sequence.motion if isinstance(sequence, FramesWithTruth) else None
+        slam = Slam(config, true_motion=true_motion, num_frames=len(sequence))
         failure = _process(sequence, slam, folder, stop)
         metrics = folder.finish(slam)
     if failure is not None:

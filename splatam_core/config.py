@@ -101,10 +101,17 @@ class TrackingConfig:
 
     method: str = _setting(
         'render_and_compare',
-        "The paper's Adam through the renderer, Gauss-Newton alignment to one render, or the expected pose as it is.",
-        choices=('render_and_compare', 'align', 'none'),
+        "The paper's Adam through the renderer, Gauss-Newton alignment to one render, the expected pose as it is, or the "
+        "true one (of recordings that have it).",
+        choices=('render_and_compare', 'align', 'none', 'truth'),
     )
     iterations: int = _setting(40, 'Steps per frame; of alignment, at most per resolution.', '', 0)
+    extend_above_m: float = _setting(
+        0.0,
+        "Of the paper's tracker: as many steps again where the depth L1, over the image's pixels, ends above this; 0 = never.",
+        'm', 0.0,
+    )  # fmt: skip
+    scale: float = _setting(1.0, 'Resolution at which frames are tracked, relative to the frame.', '', 0.05, 1.0)
     exposure: bool = _setting(True, "Of alignment: take up changes of the camera's exposure.")
     rotation_rate: float = _setting(4e-4, 'Adam step of the unit quaternion.', '', 0.0)
     translation_rate: float = _setting(2e-3, 'Adam step of the translation.', 'm', 0.0)
@@ -112,6 +119,14 @@ class TrackingConfig:
     depth_weight: float = _setting(1.0, 'Weight of the depth L1.', '', 0.0)
     silhouette_threshold: float = _setting(
         0.99, 'Pixels count only where the rendered silhouette is above this.', '', 0.0, 1.0
+    )
+    use_silhouette: bool = _setting(
+        True,
+        "Of the paper's tracker: look at sure map only; off = depth where there is a reading and colour everywhere, "
+        'also where there is no map.',
+    )
+    depth_outlier_ratio: float = _setting(
+        0.0, "Of the paper's tracker: pixels count up to this many median depth errors; 0 = all.", '', 0.0
     )
     motion_model: str = _setting(
         'constant_velocity', 'Where tracking starts from.', choices=('constant_velocity', 'last_pose')
@@ -150,7 +165,17 @@ class KeyframeConfig:
     """Which frames are kept, and which of them are mapped together (paper, section 3.4)."""
 
     every: int = _setting(5, 'Keep every n-th frame.', 'frames', 1)
+    at_least: int = _setting(
+        0, 'Keep more often where a recording is too short to give this many; live the length is not known. 0 = off.', '', 0
+    )
+    before_last: bool = _setting(False, 'Also keep the last frame but one of a recording.')
     window: int = _setting(24, 'Views in a mapping window, the current frame included.', 'frames', 1)
+    selection: str = _setting(
+        'overlap',
+        'Which kept frames fill the window beside the last: random ones that overlap the current frame, those that overlap '
+        'it most, any at random, the latest, or some spread evenly over all.',
+        choices=('overlap', 'most_overlap', 'random', 'latest', 'uniform'),
+    )
     current_share: float = _setting(
         0.0, 'Share of the steps that fit the current frame; 0 = as many as any other view of the window.', '', 0.0, 1.0
     )
@@ -175,6 +200,9 @@ class MappingConfig:
     )
     color_weight: float = _setting(0.5, 'Weight of the colour loss.', '', 0.0)
     depth_weight: float = _setting(1.0, 'Weight of the depth L1.', '', 0.0)
+    depth_outlier_ratio: float = _setting(
+        0.0, 'Readings count up to this many median depth errors; 0 = all. Not of fused fitting.', '', 0.0
+    )
     ssim_weight: float = _setting(0.2, 'Share of 1 - SSIM in the colour loss; the rest is L1.', '', 0.0, 1.0)
     means_rate: float = _setting(1e-4, 'Adam step of the centres.', 'm', 0.0)
     rgb_rate: float = _setting(2.5e-3, 'Adam step of the colours.', '', 0.0)
@@ -251,6 +279,8 @@ def with_values(config: SlamConfig, values: Mapping[str, object]) -> SlamConfig:
         config = _replace_leaf(config, name.split('.'), known[name].check(value))
     if not config.depth.min_m < config.depth.max_m:
         raise ConfigError(f'depth.min_m = {config.depth.min_m:g}: expected less than depth.max_m = {config.depth.max_m:g}')
+    if config.mapping.optimizer == 'fused' and config.mapping.depth_outlier_ratio > 0:
+        raise ConfigError('mapping.depth_outlier_ratio: fused fitting has none; set it to 0, or mapping.optimizer=autograd')
     return config
 
 
