@@ -267,6 +267,34 @@ def convert(args: argparse.Namespace) -> int:
     return 0
 
 
+# --- ablations ---
+
+
+def _add_ablations_arguments(parser: argparse.ArgumentParser) -> None:
+    _add_source_arguments(parser)
+    parser.add_argument('--preset', default='splatam', help='what all start from (default: %(default)s)')
+    parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE', help='a setting of all of them')
+    parser.add_argument('--only', nargs='+', metavar='NAME', help='some of them (default: all; see config/ablations)')
+    parser.add_argument('--out', type=Path, required=True, metavar='DIR', help='folder of the runs; finished ones are kept')
+
+
+def ablations(args: argparse.Namespace) -> int:
+    """``splatam ablations``: the paper's ablations over a recording, as a table."""
+    from splatam_core.ablations import provenance, run, table, variant_names, variants
+
+    chosen = variants(args.only or variant_names(), args.preset, args.set)
+    source = _source(args)
+    _open(source)
+    arguments = source_arguments(source)
+    folders = {variant.name: args.out / variant.name for variant in chosen}
+    for number, variant in enumerate(chosen, 1):
+        _say(f'{variant.name} ({number} of {len(chosen)})')
+        if not run(variant, arguments, source, folders[variant.name]):
+            _say(f'{variant.name} failed; see above')
+    print(f'{source.path}, preset `{args.preset}`, {provenance(folders.values())}; runs: 1.\n\n{table(folders)}')
+    return 0
+
+
 # --- shared ---
 
 
@@ -294,6 +322,17 @@ def _source(args: argparse.Namespace) -> Source:
         path, args.format, args.start, args.max_frames, args.width, args.rgb, args.depth, args.info,
         args.stride, args.crop, args.split, args.skip_bad,
     )  # fmt: skip
+
+
+def source_arguments(source: Source) -> list[str]:
+    """The arguments that name a source on the command line."""
+    options = {
+        '--format': source.format, '--start': source.start, '--max-frames': source.max_frames, '--width': source.width,
+        '--rgb': source.rgb, '--depth': source.depth, '--info': source.info, '--stride': source.stride,
+        '--crop': source.crop, '--split': source.split,
+    }  # fmt: skip
+    given = [word for name, value in options.items() if value is not None for word in (name, str(value))]
+    return [source.path, *given, *(['--skip-bad'] if source.skip_bad else [])]
 
 
 def _open(source: Source) -> FrameSequence:
@@ -357,6 +396,7 @@ def _text(value: float | None, factor: float, digits: str, unit: str) -> str:
 COMMANDS = (
     Command('run', 'run SLAM over a recording', _add_run_arguments, run),
     Command('evaluate', 'score a run and draw its report', _add_evaluate_arguments, evaluate),
+    Command('ablations', "run the paper's ablations over a recording", _add_ablations_arguments, ablations),
     Command('convert', 'write a recording as a rosbag2', _add_convert_arguments, convert),
 )
 

@@ -261,9 +261,27 @@ def load_config(preset: str | None = None, overrides: Mapping[str, object] | Ite
     Raises:
         ConfigError: an unknown preset or key, or a value that is not allowed.
     """
-    values = {} if preset is None else _flatten(_read_preset(preset), '')
-    values |= overrides if isinstance(overrides, Mapping) else dict(map(_parse_override, overrides))
+    values = {} if preset is None else read_values(preset)
+    values |= overrides if isinstance(overrides, Mapping) else parse_overrides(overrides)
     return with_values(SlamConfig(), values)
+
+
+def read_values(preset: str) -> dict[str, object]:
+    """What a preset or YAML file sets: dotted names to values, unchecked.
+
+    Raises:
+        ConfigError: there is no such preset, or the file is no mapping.
+    """
+    return _flatten(_read_preset(preset), '')
+
+
+def parse_overrides(texts: Iterable[str]) -> dict[str, object]:
+    """Texts ``name=value`` as dotted names to values, unchecked.
+
+    Raises:
+        ConfigError: a text is not of that form.
+    """
+    return dict(map(_parse_override, texts))
 
 
 def with_values(config: SlamConfig, values: Mapping[str, object]) -> SlamConfig:

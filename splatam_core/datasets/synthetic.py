@@ -14,8 +14,8 @@ SOURCE is ``synthetic``, or ``synthetic:`` and options with commas between::
     frames and then goes on along nearly the same way.
 ``motion``
     ``calm`` (default): a hand that looks around one side of the room. ``fast``: one that turns all the
-    way round in 120 frames, by 1 to 5 degrees from frame to frame, so that parts of the room that were
-    never seen come into view all the time. That is farther than preset ``splatam`` can turn in a
+    way round in 120 frames, by 1 degree from frame to frame at the start and by 5 after 30 frames, so that
+    parts of the room that were never seen come into view all the time. That is soon farther than preset ``splatam`` can turn in a
     frame's 40 steps (2 x 40 x 4e-4 rad = 1.8 degrees) unless it predicts the motion, and changes so
     slowly that a prediction at constant velocity is within half a degree.
 
@@ -101,7 +101,10 @@ class Walk:
         """The walk of a seed."""
         rng = np.random.default_rng([seed, 0])
         turn = 2 * np.pi
-        return cls(motion, rng.uniform(0, turn, 4), rng.uniform(0.4, 2.2, (6, 3)), rng.uniform(0, turn, (6, 3)))
+        phases = rng.uniform(0, turn, 4)
+        if motion == 'fast':
+            phases[2] = np.pi / 2 if phases[2] < np.pi else 3 * np.pi / 2  # where it turns slowest
+        return cls(motion, phases, rng.uniform(0.4, 2.2, (6, 3)), rng.uniform(0, turn, (6, 3)))
 
     def pose(self, frame: int) -> NDArray[np.float64]:
         """[4, 4] camera to world. At most about 0.35 m/s and 25 degrees/s when calm, 0.8 m/s and 160 degrees/s when fast."""

@@ -124,6 +124,7 @@ def test_fast_walk_needs_prediction_and_shows_new_ground():
         steps = np.array([se3.log(se3.inverse(a) @ b) for a, b in pairwise(truth)])
         turned, surprise = np.linalg.norm(steps[:, 3:], axis=1), np.linalg.norm(np.diff(steps[:, 3:], axis=0), axis=1)
         assert ((turned > reach).mean() > 0.6) == (sequence._walk.motion == 'fast')
+        assert turned[0] < reach  # the first step is nobody's to predict
         assert surprise.max() < 0.3 * reach
         assert np.linalg.norm(np.diff(steps[:, :3], axis=0), axis=1).max() < 0.3 * config.iterations * config.translation_rate
         assert np.all(np.abs(truth[:, :3, 3]) < np.array([0.8, 0.8, 1.6]))
