@@ -192,6 +192,9 @@ class MappingConfig:
     every: int = _setting(1, 'Densify and refine on every n-th frame.', 'frames', 1)
     iterations: int = _setting(60, 'Optimisation steps per mapped frame.', '', 0)
     first_iterations: int = _setting(0, 'More steps on the first frame.', '', 0)
+    anisotropic: bool = _setting(
+        False, 'Gaussians with three radii and a rotation instead of one radius; several times slower. Not with fused fitting.'
+    )
     optimizer: str = _setting(
         'autograd',
         "The paper's: Adam started anew on every mapped frame; or one native step that renders, compares (L1 only) and "
@@ -208,6 +211,7 @@ class MappingConfig:
     rgb_rate: float = _setting(2.5e-3, 'Adam step of the colours.', '', 0.0)
     opacity_rate: float = _setting(0.05, 'Adam step of the opacity logits.', '', 0.0)
     scale_rate: float = _setting(1e-3, 'Adam step of the log scales.', '', 0.0)
+    rotation_rate: float = _setting(1e-3, "Adam step of anisotropic Gaussians' unit quaternions.", '', 0.0)
     prune_every: int = _setting(20, 'Prune before every n-th step of a frame; 0 = never.', 'steps', 0)
     prune_until: int = _setting(20, 'Last step of a frame that may prune.', 'steps', 0)
     prune_opacity: float = _setting(0.005, 'Prune Gaussians fainter than this.', '', 0.0, 1.0)
@@ -297,6 +301,11 @@ def with_values(config: SlamConfig, values: Mapping[str, object]) -> SlamConfig:
         config = _replace_leaf(config, name.split('.'), known[name].check(value))
     if not config.depth.min_m < config.depth.max_m:
         raise ConfigError(f'depth.min_m = {config.depth.min_m:g}: expected less than depth.max_m = {config.depth.max_m:g}')
+    if config.mapping.optimizer == 'fused' and config.mapping.anisotropic:
+        raise ConfigError(
+            'mapping.anisotropic = true: fused fitting knows isotropic Gaussians only; set it to false, or '
+            'mapping.optimizer=autograd'
+        )
     if config.mapping.optimizer == 'fused' and config.mapping.depth_outlier_ratio > 0:
         raise ConfigError('mapping.depth_outlier_ratio: fused fitting has none; set it to 0, or mapping.optimizer=autograd')
     return config

@@ -43,7 +43,7 @@ def refine(
 
 def rates(config: MappingConfig) -> Rates:
     """Adam's."""
-    return Rates(config.means_rate, config.scale_rate, config.opacity_rate, config.rgb_rate)
+    return Rates(config.means_rate, config.scale_rate, config.opacity_rate, config.rgb_rate, config.rotation_rate)
 
 
 def _fit_by_autograd(

@@ -53,7 +53,7 @@ class Slam:
 
     def reset(self) -> None:
         """Forget map, poses and camera; the next frame starts a new world."""
-        self.map = GaussianMap()
+        self.map = GaussianMap(self.config.mapping.anisotropic)
         self.camera: PinholeCamera | None = None
         self._keyframes: list[PosedView] = []
         self._motion = self._motion_model()
@@ -110,7 +110,12 @@ class Slam:
         Args:
             gaussians: the map.
             T_world_cam: [4, 4] about where the camera is in it.
+
+        Raises:
+            ConfigError: they are anisotropic, and the configuration is not.
         """
+        if gaussians.rotations is not None and not self.config.mapping.anisotropic:
+            raise ConfigError('the map is of anisotropic Gaussians: set mapping.anisotropic=true')
         self.reset()
         self.map.append(gaussians)
         self._motion.place(T_world_cam)

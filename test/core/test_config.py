@@ -84,6 +84,8 @@ def test_wrong_overrides_say_what_is_right(override: str, message: str) -> None:
 
 
 def test_settings_that_exclude_each_other_are_refused() -> None:
+    with pytest.raises(ConfigError, match='anisotropic.*mapping.optimizer=autograd'):
+        load_config('realtime', ['mapping.anisotropic=true'])
     with pytest.raises(ConfigError, match='depth_outlier_ratio.*mapping.optimizer=autograd'):
         load_config('realtime', ['mapping.depth_outlier_ratio=10'])
 
