@@ -291,8 +291,19 @@ def ablations(args: argparse.Namespace) -> int:
         _say(f'{variant.name} ({number} of {len(chosen)})')
         if not run(variant, arguments, source, folders[variant.name]):
             _say(f'{variant.name} failed; see above')
-    print(f'{source.path}, preset `{args.preset}`, {provenance(folders.values())}; runs: 1.\n\n{table(folders)}')
+    title = f'{Path(source.path).name}{_window_text(source)}, preset `{args.preset}`'
+    print(f'{title}; {provenance(folders.values())}; runs: 1.\n\n{table(folders)}')
     return 0
+
+
+def _window_text(source: Source) -> str:
+    parts = [
+        f'from frame {source.start}' if source.start else '',
+        f'stride {source.stride}' if source.stride > 1 else '',
+        f'at most {source.max_frames} frames' if source.max_frames else '',
+        f'width {source.width}' if source.width else '',
+    ]
+    return ''.join(f', {part}' for part in parts if part)
 
 
 # --- shared ---
