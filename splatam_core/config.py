@@ -113,6 +113,7 @@ class TrackingConfig:
     )  # fmt: skip
     scale: float = _setting(1.0, 'Resolution at which frames are tracked, relative to the frame.', '', 0.05, 1.0)
     exposure: bool = _setting(True, "Of alignment: take up changes of the camera's exposure.")
+    lag: bool = _setting(True, 'Of alignment: take up that colour and depth of a frame were taken at different times.')
     rotation_rate: float = _setting(4e-4, 'Adam step of the unit quaternion.', '', 0.0)
     translation_rate: float = _setting(2e-3, 'Adam step of the translation.', 'm', 0.0)
     color_weight: float = _setting(0.5, 'Weight of the colour L1.', '', 0.0)

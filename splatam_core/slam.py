@@ -81,7 +81,9 @@ class Slam:
             return self._initialize(index, frame, view, clock)
 
         guess = se3.inverse(self._motion.predict(frame.stamp_ns))
-        tracking = self._tracker.track(view.scaled(self.config.tracking.scale), self.map.gaussians, guess)
+        before = se3.inverse(self._motion.last_pose)
+        view_to_track = view.scaled(self.config.tracking.scale)
+        tracking = self._tracker.track(view_to_track, self.map.gaussians, guess, before)
         clock.lap('track')
         if tracking.failure:
             self._motion.stop()
@@ -89,7 +91,8 @@ class Slam:
                                 tracking.sure_fraction, tracking.inlier_fraction)  # fmt: skip
 
         T_world_cam = se3.inverse(tracking.T_cam_world)
-        self._motion.observe(frame.stamp_ns, T_world_cam)
+        # Depth sets the pace: a colour frame that comes late, or twice, says little about how the camera moves.
+        self._motion.observe(frame.stamp_ns, se3.inverse(tracking.T_cam_world_depth))
         is_keyframe = self._map(index, _posed(view, tracking.T_cam_world), tracking.sure_fraction, clock)
         return self._result(index, frame, Status.TRACKED, T_world_cam, is_keyframe, clock, '',
                             tracking.sure_fraction, tracking.inlier_fraction)  # fmt: skip

@@ -68,12 +68,30 @@ static inline void slopes_by_twist(Lanes a, Lanes b, Lanes x, Lanes y, Lanes z, 
   slopes[3] = c * y - b * z, slopes[4] = a * z - c * x, slopes[5] = b * x - a * y;
 }
 
-static void align(const float* brightness, const float* depth, const Camera& camera, int begin, int end,
-                  const float* layers, const Pose& motion, const AlignmentSettings& settings, AlignmentSums& sums,
-                  ResidualHistogram& histogram) {
+// Eight points of the reference where the frame would show them.
+struct Moved {
+  Lanes x, y, z, inverse_z, u, v;
+  IntLanes inside;
+};
+
+static inline Moved moved(const Pose& motion, Lanes px, Lanes py, Lanes pz, IntLanes known, const Camera& camera) {
   const float *R = motion.R, *t = motion.t;
-  const float right = float(camera.width - 1), bottom = float(camera.height - 1);
+  Moved p;
+  p.x = R[0] * px + R[1] * py + R[2] * pz + t[0];
+  p.y = R[3] * px + R[4] * py + R[5] * pz + t[1];
+  p.z = R[6] * px + R[7] * py + R[8] * pz + t[2];
+  p.inverse_z = 1.0f / p.z;
+  p.u = camera.fx * p.x * p.inverse_z + camera.cx, p.v = camera.fy * p.y * p.inverse_z + camera.cy;
+  p.inside = known & (p.z > 0.0f) & (p.u >= 0.0f) & (p.v >= 0.0f) & (p.u < float(camera.width - 1)) &
+             (p.v < float(camera.height - 1));
+  return p;
+}
+
+static void align(const float* brightness, const float* depth, const Camera& camera, int begin, int end,
+                  const float* layers, const Pose& light_motion, const Pose& depth_motion,
+                  const AlignmentSettings& settings, AlignmentSums& sums, ResidualHistogram& histogram) {
   const Lanes nan = splat(__builtin_nanf(""));
+  const bool is_split = __builtin_memcmp(&light_motion, &depth_motion, sizeof(Pose)) != 0;
   for (int row = begin; row < end; ++row) {
     Lanes H[kUnknowns * (kUnknowns + 1) / 2] = {}, g[kUnknowns] = {}, cost{};
     const float ray_y = (row - camera.cy) / camera.fy;
@@ -88,17 +106,23 @@ static void align(const float* brightness, const float* depth, const Camera& cam
       if (points == 0) continue;
       sums.points += points;
       const Lanes px = (iota() + (float(first) - camera.cx)) / camera.fx * range, py = ray_y * range;
-      const Lanes x = R[0] * px + R[1] * py + R[2] * range + t[0];
-      const Lanes y = R[3] * px + R[4] * py + R[5] * range + t[1];
-      const Lanes z = R[6] * px + R[7] * py + R[8] * range + t[2];
-      const Lanes inverse_z = 1.0f / z;
-      const Lanes u = camera.fx * x * inverse_z + camera.cx, v = camera.fy * y * inverse_z + camera.cy;
-      const IntLanes inside = known & (z > 0.0f) & (u >= 0.0f) & (v >= 0.0f) & (u < right) & (v < bottom);
+      const Moved d = moved(depth_motion, px, py, range, known, camera);
       Lanes frame[kLayers];
-      sample(layers, camera.width, u, v, inside, frame);
-      Lanes depth_residual = (frame[3] - z) * inverse_z;
-      sums.compared += count(inside & (frame[3] == frame[3]));
-      const IntLanes seen = inside & (absolute(depth_residual) < settings.max_depth_ratio);  // NaN is not
+      sample(layers, camera.width, d.u, d.v, d.inside, frame);
+      Lanes depth_residual = (frame[3] - d.z) * d.inverse_z;
+      sums.compared += count(d.inside & (frame[3] == frame[3]));
+      IntLanes seen = d.inside & (absolute(depth_residual) < settings.max_depth_ratio);  // NaN is not
+      Lanes by_light[kUnknowns], by_depth[6];
+      slopes_by_twist(frame[4] * camera.fx * d.inverse_z, frame[5] * camera.fy * d.inverse_z, d.x, d.y, d.z, d.inverse_z,
+                      by_depth);
+      by_depth[2] -= 1.0f;
+      by_depth[3] -= d.y;
+      by_depth[4] += d.x;
+      const Moved l = is_split ? moved(light_motion, px, py, range, known, camera) : d;
+      if (is_split) {
+        seen &= l.inside;
+        sample(layers, camera.width, l.u, l.v, seen, frame);
+      }
       sums.seen += count(seen);
       Lanes light_residual = keep(seen, frame[0] - (settings.gain * light + settings.bias));
       depth_residual = keep(seen, depth_residual);
@@ -107,16 +131,14 @@ static void align(const float* brightness, const float* depth, const Camera& cam
       sums.agreeing += count(seen & (absolute(light_residual) <= settings.inlier_light) &
                              (absolute(depth_residual) <= settings.inlier_depth));
 
-      Lanes by_light[kUnknowns], by_depth[6];
-      slopes_by_twist(frame[1] * camera.fx * inverse_z, frame[2] * camera.fy * inverse_z, x, y, z, inverse_z, by_light);
+      slopes_by_twist(frame[1] * camera.fx * l.inverse_z, frame[2] * camera.fy * l.inverse_z, l.x, l.y, l.z, l.inverse_z,
+                      by_light);
       by_light[6] = -light;
       by_light[7] = splat(-1.0f);
-      slopes_by_twist(frame[4] * camera.fx * inverse_z, frame[5] * camera.fy * inverse_z, x, y, z, inverse_z, by_depth);
-      by_depth[2] -= 1.0f;
-      by_depth[3] -= y;
-      by_depth[4] += x;
+      by_light[8] = Lanes{};
+      for (int i = 0; i < 6; ++i) by_light[8] += by_light[i] * settings.velocity[i];
       for (int i = 0; i < kUnknowns; ++i) by_light[i] = keep(seen, by_light[i]);
-      for (int i = 0; i < 6; ++i) by_depth[i] = keep(seen, by_depth[i] * inverse_z);
+      for (int i = 0; i < 6; ++i) by_depth[i] = keep(seen, by_depth[i] * d.inverse_z);
 
       const float light_precision = 1.0f / (settings.light_scale * settings.light_scale);
       const float depth_precision = 1.0f / (settings.depth_scale * settings.depth_scale);

@@ -40,11 +40,13 @@ void Aligner::for_rows(int rows, Task&& task) {
 }
 
 Aligner::Result Aligner::linearize(const float* brightness, const float* depth, const Camera& camera,
-                                   const float* layers, const Pose& motion, const AlignmentSettings& settings) {
+                                   const float* layers, const Pose& light_motion, const Pose& depth_motion,
+                                   const AlignmentSettings& settings) {
   std::vector<AlignmentSums> sums(pool_.size());
   std::vector<ResidualHistogram> histograms(pool_.size());
   for_rows(camera.height, [&](int thread, int begin, int end) {
-    kernels_.align(brightness, depth, camera, begin, end, layers, motion, settings, sums[thread], histograms[thread]);
+    kernels_.align(brightness, depth, camera, begin, end, layers, light_motion, depth_motion, settings, sums[thread],
+                   histograms[thread]);
   });
   for (int thread = 1; thread < pool_.size(); ++thread) {
     add(sums[0], sums[thread]);

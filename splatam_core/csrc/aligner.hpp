@@ -18,8 +18,8 @@ class Aligner {
   };
 
   // Repeatable for a fixed number of threads.
-  Result linearize(const float* brightness, const float* depth, const Camera&, const float* layers, const Pose& motion,
-                   const AlignmentSettings&);
+  Result linearize(const float* brightness, const float* depth, const Camera&, const float* layers,
+                   const Pose& light_motion, const Pose& depth_motion, const AlignmentSettings&);
 
   // Half the size: averages of 2x2 blocks, and no depth (NaN) where a block is no surface.
   void halve(const float* brightness, const float* depth, int width, int height, float max_step, float* half_brightness,

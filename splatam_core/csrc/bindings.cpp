@@ -85,15 +85,19 @@ py::array_t<double> symmetric(const double* triangle) {
 }
 
 py::tuple linearize(Aligner& aligner, const Array& brightness, const Array& depth, const Array& layers, float fx,
-                    float fy, float cx, float cy, const Array& motion, float gain, float bias, float light_scale,
-                    float depth_scale, float max_depth_ratio, float inlier_light, float inlier_depth) {
+                    float fy, float cx, float cy, const Array& light_motion, const Array& depth_motion,
+                    const Array& velocity, float gain, float bias, float light_scale, float depth_scale,
+                    float max_depth_ratio, float inlier_light, float inlier_depth) {
   const Camera camera{int(brightness.shape(1)), int(brightness.shape(0)), fx, fy, cx, cy};
-  const AlignmentSettings settings{gain,  bias, light_scale, depth_scale, max_depth_ratio, inlier_light, inlier_depth};
-  const Pose pose = pose_of(motion);
+  const float* v = velocity.data();
+  const AlignmentSettings settings{gain,        bias,        {v[0], v[1], v[2], v[3], v[4], v[5]},
+                                   light_scale, depth_scale, max_depth_ratio,
+                                   inlier_light, inlier_depth};
+  const Pose light_pose = pose_of(light_motion), depth_pose = pose_of(depth_motion);
   Aligner::Result result;
   {
     py::gil_scoped_release release;
-    result = aligner.linearize(brightness.data(), depth.data(), camera, layers.data(), pose, settings);
+    result = aligner.linearize(brightness.data(), depth.data(), camera, layers.data(), light_pose, depth_pose, settings);
   }
   const auto& sums = result.sums;
   return py::make_tuple(symmetric(sums.H), py::array_t<double>(kUnknowns, sums.g), sums.cost, sums.points,

@@ -85,8 +85,8 @@ struct TileList {
 // so that a pixel is a vector. NaN in the depth marks what is no surface.
 constexpr int kLayers = 8;
 
-// The linearised residuals of an alignment, sum by sum. Unknowns: six of the twist, then the light's gain and bias.
-constexpr int kUnknowns = 8;
+// The linearised residuals of an alignment, sum by sum. Unknowns: six of the twist, then the light's gain, bias and lag.
+constexpr int kUnknowns = 9;
 struct AlignmentSums {
   double H[kUnknowns * (kUnknowns + 1) / 2];  // upper triangle, row by row
   double g[kUnknowns];
@@ -97,6 +97,7 @@ struct AlignmentSums {
 
 struct AlignmentSettings {
   float gain, bias;                     // of the light: frame = gain * reference + bias
+  float velocity[6];                    // twist a second: how the light's pose changes with its lag
   float light_scale, depth_scale;       // of the residuals; that of depth is relative
   float max_depth_ratio;                // larger differences are other surfaces
   float inlier_light, inlier_depth;     // what counts as agreeing
@@ -146,8 +147,10 @@ struct Kernels {
                  const AdamRates&, float* bounds);
 
   // Rows [begin, end) of a reference [H, W] against a frame's layers: how the camera should move, and what agrees.
+  // The frame's light may have been taken at another time than its depth, so each has its own motion.
   void (*align)(const float* brightness, const float* depth, const Camera&, int begin, int end, const float* layers,
-                const Pose& motion, const AlignmentSettings&, AlignmentSums&, ResidualHistogram&);
+                const Pose& light_motion, const Pose& depth_motion, const AlignmentSettings&, AlignmentSums&,
+                ResidualHistogram&);
 
   const char* name;
 };

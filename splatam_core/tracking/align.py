@@ -4,8 +4,9 @@ Where the paper's tracker differentiates the renderer in every step, this one re
 then treats that picture as a reference: each pixel where the silhouette is sure is a point with a colour, and the
 camera moves until the points land on equal brightness and equal depth in the frame (direct alignment as in DVO,
 Kerl et al. 2013: Student-t weights, scales from the data). Colour and depth share one system, so rotation and
-translation, which look alike to first-order steps, are told apart at once; two more unknowns take up what the camera's
-automatic exposure does to brightness.
+translation, which look alike to first-order steps, are told apart at once. Two more unknowns take up what the camera's
+automatic exposure does to brightness, and one the time by which colour lags depth: few cameras take both at once, and a
+moving one shows them from different places (docs/decisions/0005-lag.md). The pose of a frame is that of its colour.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -37,7 +38,7 @@ _MIN_SCALES = 0.004, 0.001  # of brightness and of relative depth: no sensor is 
 _FIRST_SCALES = 0.1, 0.02
 _SMALL_STEP = 1e-5
 _LEAST_WEIGHT = 1e-6
-_PRIOR = np.array([0.3] * 6 + [0.1] * 2) ** -2  # spread of a step (m, rad), of gain and of bias
+_PRIOR = np.array([0.3] * 6 + [0.1] * 2 + [0.5]) ** -2  # spread of a step (m, rad), of gain, bias, and lag (frames)
 
 
 class AlignmentTracker:
@@ -48,20 +49,23 @@ class AlignmentTracker:
         self._config = config
         self._aligner = _native.Aligner(threads or len(os.sched_getaffinity(0)))
 
-    def track(self, view: View, gaussians: Gaussians, T_cam_world: Matrix) -> TrackingResult:
+    def track(
+        self, view: View, gaussians: Gaussians, T_cam_world: Matrix, T_cam_world_before: Matrix | None = None
+    ) -> TrackingResult:
         """See ``Tracker.track``."""
         with torch.no_grad():
             render = self._rasterizer.render(gaussians, view.camera, torch.from_numpy(T_cam_world).float())
         depth = np.where(view.valid, view.depth, np.float32(np.nan))
         frames = self._levels(_Picture(view.camera, _brightness(view.rgb8.numpy().astype(np.float32) / 255), depth))
         references = self._levels(_reference(view.camera, render, self._config.silhouette_threshold))
-        alignment = self._align(references, frames)
+        from_before = np.eye(4) if T_cam_world_before is None else T_cam_world @ se3.inverse(T_cam_world_before)
+        alignment = self._align(references, frames, from_before)
         fit = alignment.fit
         readings = int(np.isfinite(frames[0].depth).sum())
         sure_fraction, inlier_fraction = fit.compared / max(1, readings), fit.agreeing / max(1, fit.compared)
-        T_cam_world = alignment.motion @ T_cam_world
-        reason = failure(T_cam_world, readings, sure_fraction, inlier_fraction, self._config)
-        return TrackingResult(T_cam_world, sure_fraction, inlier_fraction, reason)
+        at_color, at_depth = alignment.state.light_motion @ T_cam_world, alignment.state.motion @ T_cam_world
+        reason = failure(at_color, readings, sure_fraction, inlier_fraction, self._config)
+        return TrackingResult(at_color, at_depth, sure_fraction, inlier_fraction, reason)
 
     def _levels(self, picture: _Picture) -> list[_Picture]:
         """The picture at a half, a quarter, ...; itself where it is too small for that.
@@ -77,24 +81,29 @@ class AlignmentTracker:
             picture = _Picture(camera, *self._aligner.halve(picture.brightness, picture.depth, _EDGE))
             yield picture
 
-    def _align(self, references: list[_Picture], frames: list[_Picture]) -> _Alignment:
+    def _align(self, references: list[_Picture], frames: list[_Picture], from_before: Matrix) -> _Alignment:
         """Coarse to fine; the first guess where that explains the finest level better."""
-        state, scales = _State(np.eye(4), 1.0, 0.0), _FIRST_SCALES
+        guess = state = _State(np.eye(4))
+        scales, free = _FIRST_SCALES, self._free_unknowns()
         for reference, frame in zip(reversed(references), reversed(frames), strict=True):
             layers = self._aligner.layers(frame.brightness, frame.depth, _EDGE)
             for _ in range(self._config.iterations):
+                state = state.moving_at(se3.log(state.motion @ from_before))
                 fit = self._fit(reference, layers, state, scales)
-                step, scales = fit.step(state, self._config.exposure), fit.scales
+                step, scales = fit.step(state, free), fit.scales
                 if step is None:
                     break
                 state = state.moved(step)
                 if np.abs(step[:6]).max() < _SMALL_STEP:
                     break
-        guess = self._fit(references[0], layers, _State(np.eye(4), 1.0, 0.0), scales)
+        at_guess = self._fit(references[0], layers, guess, scales)
         found = self._fit(references[0], layers, state, scales)
-        unseen_cost = guess.cost / max(1, guess.seen)
-        better = 2 * found.seen > guess.seen and found.total_cost(unseen_cost) < guess.total_cost(unseen_cost)
-        return _Alignment(state.motion, found) if better else _Alignment(np.eye(4), guess)
+        unseen_cost = at_guess.cost / max(1, at_guess.seen)
+        better = 2 * found.seen > at_guess.seen and found.total_cost(unseen_cost) < at_guess.total_cost(unseen_cost)
+        return _Alignment(state, found) if better else _Alignment(guess, at_guess)
+
+    def _free_unknowns(self) -> list[int]:
+        return [*range(6), *[6, 7] * self._config.exposure, *[8] * self._config.lag]
 
     def _fit(self, reference: _Picture, layers: Array, state: _State, scales: tuple[float, float]) -> _Fit:
         camera, config = reference.camera, self._config
@@ -103,8 +112,8 @@ class AlignmentTracker:
         return _Fit(
             *self._aligner.linearize(
                 reference.brightness, reference.depth, layers, camera.fx, camera.fy, camera.cx, camera.cy,
-                state.motion.astype(np.float32), state.gain, state.bias, *weighted, 2 * _EDGE,
-                config.inlier_color, config.inlier_depth,
+                state.light_motion.astype(np.float32), state.motion.astype(np.float32), state.velocity.astype(np.float32),
+                state.gain, state.bias, *weighted, 2 * _EDGE, config.inlier_color, config.inlier_depth,
             )
         )  # fmt: skip
 
@@ -129,19 +138,34 @@ class _State:
     """What is sought.
 
     Attributes:
-        motion: [4, 4] from the reference's camera to the frame's.
+        motion: [4, 4] from the reference's camera to the frame's, when depth was taken.
         gain: the frame's brightness is gain times the reference's, plus bias.
         bias: see gain.
+        lag: of colour behind depth, in frames.
+        velocity: [6] of the points before the camera, twist a frame.
     """
 
     motion: Matrix
-    gain: float
-    bias: float
+    gain: float = 1.0
+    bias: float = 0.0
+    lag: float = 0.0
+    velocity: Matrix = field(default_factory=lambda: np.zeros(6))
 
-    def moved(self, step: Matrix) -> _State:
-        """After a step [6 or 8] of the twist, and of gain and bias where they are free."""
-        gain, bias = (self.gain + step[6], self.bias + step[7]) if len(step) == 8 else (self.gain, self.bias)
-        return _State(se3.exp(step[:6]) @ self.motion, gain, bias)
+    @property
+    def light_motion(self) -> Matrix:
+        """[4, 4] as ``motion``, when colour was taken."""
+        return se3.exp(self.lag * self.velocity) @ self.motion if self.lag else self.motion
+
+    def moving_at(self, velocity: Matrix) -> _State:
+        """The same with another estimate of the velocity."""
+        return replace(self, velocity=velocity)
+
+    def moved(self, change: Matrix) -> _State:
+        """After a change [9] of the unknowns."""
+        return _State(
+            se3.exp(change[:6]) @ self.motion, self.gain + change[6], self.bias + change[7], self.lag + change[8],
+            self.velocity,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,8 +173,8 @@ class _Fit:
     """The residuals at a state, linearised.
 
     Attributes:
-        H: [8, 8] normal equations: twist, gain, bias.
-        g: [8].
+        H: [9, 9] normal equations: twist, gain, bias, lag.
+        g: [9].
         cost: of the points seen, robust.
         points: points of the reference.
         compared: those that fall on a reading of the frame.
@@ -175,20 +199,21 @@ class _Fit:
         """The residuals' own spread."""
         return max(_MIN_SCALES[0], 1.4826 * self.light_median), max(_MIN_SCALES[1], 1.4826 * self.depth_median)
 
-    def step(self, state: _State, exposure: bool) -> Matrix | None:
-        """[8] (or [6], without exposure) what best removes the residuals; None where they do not determine it.
+    def step(self, state: _State, free: list[int]) -> Matrix | None:
+        """[9] the change of the free unknowns that best removes the residuals; None where they do not determine it.
 
         On a ramp of brightness a shift looks like a change of bias: what the residuals leave open, the priors settle.
         """
         if self.seen < _MIN_POINTS:
             return None
         H, g = self.H + np.diag(_PRIOR), self.g.copy()
-        g[6:] += _PRIOR[6:] * (state.gain - 1, state.bias)
-        free = 8 if exposure else 6
+        g[6:] += _PRIOR[6:] * (state.gain - 1, state.bias, state.lag)
+        step = np.zeros(len(g))
         try:
-            return -np.linalg.solve(H[:free, :free], g[:free])
+            step[free] = -np.linalg.solve(H[np.ix_(free, free)], g[free])
         except np.linalg.LinAlgError:
             return None
+        return step
 
     def total_cost(self, unseen_cost: float) -> float:
         """Robust cost; a state that sees less of the map is not better for it."""
@@ -197,9 +222,9 @@ class _Fit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Alignment:
-    """The motion found, and how the finest level fits there."""
+    """The state found, and how the finest level fits there."""
 
-    motion: Matrix
+    state: _State
     fit: _Fit
 
 

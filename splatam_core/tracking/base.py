@@ -14,19 +14,23 @@ from splatam_core.losses import TrackingLoss, tracking_loss
 from splatam_core.rasterizer import Gaussians, Render
 from splatam_core.view import View
 
+Matrix = NDArray[np.float64]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackingResult:
     """A pose and the evidence for it.
 
     Attributes:
-        T_cam_world: [4, 4] float64.
+        T_cam_world: [4, 4] float64, when colour was taken.
+        T_cam_world_depth: [4, 4] float64, when depth was taken; the same for trackers that take the two to be one.
         sure_fraction: share of the pixels with depth that see sure map.
         inlier_fraction: share of those that agree with the map in depth and colour.
         failure: why the pose must not be used; empty where it may be.
     """
 
-    T_cam_world: NDArray[np.float64]
+    T_cam_world: Matrix
+    T_cam_world_depth: Matrix
     sure_fraction: float
     inlier_fraction: float
     failure: str
@@ -35,8 +39,17 @@ class TrackingResult:
 class Tracker(Protocol):
     """A way to find the camera."""
 
-    def track(self, view: View, gaussians: Gaussians, T_cam_world: NDArray[np.float64]) -> TrackingResult:
-        """Find the pose from which the map looks like the view, from a first guess; changes nothing."""
+    def track(
+        self, view: View, gaussians: Gaussians, T_cam_world: Matrix, T_cam_world_before: Matrix | None = None
+    ) -> TrackingResult:
+        """Find the pose from which the map looks like the view; changes nothing.
+
+        Args:
+            view: what the camera sees.
+            gaussians: the map.
+            T_cam_world: [4, 4] first guess.
+            T_cam_world_before: [4, 4] where the camera was a frame ago, if that is known.
+        """
         ...
 
 
@@ -82,7 +95,7 @@ def judge(T_cam_world: NDArray[np.float64], render: Render, view: View, config: 
     sure_fraction = num_sure / max(1, readings)
     inlier_fraction = int((sure & depth_agrees & color_agrees).sum()) / max(1, num_sure)
     reason = failure(T_cam_world, readings, sure_fraction, inlier_fraction, config)
-    return TrackingResult(T_cam_world, sure_fraction, inlier_fraction, reason)
+    return TrackingResult(T_cam_world, T_cam_world, sure_fraction, inlier_fraction, reason)
 
 
 def failure(

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from splatam_core.config import TrackingConfig
 from splatam_core.rasterizer import Gaussians, Rasterizer
-from splatam_core.tracking.base import TrackingResult
+from splatam_core.tracking.base import Matrix, TrackingResult
 from splatam_core.view import View
 
 
@@ -20,6 +17,8 @@ class NullTracker:
     def __init__(self, rasterizer: Rasterizer, config: TrackingConfig, threads: int = 0) -> None:
         pass
 
-    def track(self, view: View, gaussians: Gaussians, T_cam_world: NDArray[np.float64]) -> TrackingResult:
+    def track(
+        self, view: View, gaussians: Gaussians, T_cam_world: Matrix, T_cam_world_before: Matrix | None = None
+    ) -> TrackingResult:
         """See ``Tracker.track``."""
-        return TrackingResult(T_cam_world, sure_fraction=1.0, inlier_fraction=1.0, failure='')
+        return TrackingResult(T_cam_world, T_cam_world, sure_fraction=1.0, inlier_fraction=1.0, failure='')

@@ -13,7 +13,7 @@ from splatam_core import se3
 from splatam_core.config import TrackingConfig
 from splatam_core.losses import TrackingLoss, tracking_loss
 from splatam_core.rasterizer import Gaussians, Rasterizer
-from splatam_core.tracking.base import Candidate, TrackingResult, judge
+from splatam_core.tracking.base import Candidate, Matrix, TrackingResult, judge
 from splatam_core.view import View
 
 
@@ -24,7 +24,9 @@ class RenderAndCompareTracker:
         self._rasterizer = rasterizer
         self._config = config
 
-    def track(self, view: View, gaussians: Gaussians, T_cam_world: NDArray[np.float64]) -> TrackingResult:
+    def track(
+        self, view: View, gaussians: Gaussians, T_cam_world: Matrix, T_cam_world_before: Matrix | None = None
+    ) -> TrackingResult:
         """See ``Tracker.track``."""
         config, gaussians = self._config, gaussians.detached()
         rotation = torch.tensor(se3.quaternion_from_rotation(T_cam_world[:3, :3]), dtype=torch.float32)
