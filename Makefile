@@ -13,13 +13,14 @@ PYTHON ?= $(firstword $(FINDABLE))
 export SPLATAM_DATA ?= $(abspath ../shared/data)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup test tf2_msgs demo colcon check-aarch64 clean
+.PHONY: help setup test tf2_msgs demo paper-tables colcon check-aarch64 clean
 
 help:
 	@echo 'make setup           make $(VENV) with everything in it (PYTHON=python3.11 chooses the interpreter)'
 	echo 'make test            run the whole test suite'
 	echo 'make tf2_msgs        build the messages of /tf into $(VENV), for a ROS from pip, which lacks them'
 	echo 'make demo [BAG=path] play a recording into the node and score what comes out, in out/demo'
+	echo 'make paper-tables    ablations, metrics and held-out views on the recordings in SPLATAM_DATA: hours, and goes on where it stopped'
 	echo 'make colcon          build and test as a ROS package, in a scratch workspace'
 	echo 'make check-aarch64   compile the kernels for the processors of robots'
 	echo 'make clean           remove what was built; $(VENV) and out stay'
@@ -56,6 +57,9 @@ test: setup tf2_msgs
 
 demo: setup
 	@$(BIN)/python -m splatam_ros.demo $(if $(BAG),'$(BAG)')
+
+paper-tables: setup
+	@$(BIN)/python benchmarks/paper_tables.py --data "$$SPLATAM_DATA"
 
 # A ROS workspace as colcon sees it, outside the checkout; its virtual environment does not hold splatam_ros.
 colcon: $(VENV)/.created

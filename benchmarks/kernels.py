@@ -40,10 +40,8 @@ def wavy_wall(cam: PinholeCamera) -> Gaussians:
 def with_gradients(gaussians: Gaussians) -> Gaussians:
     """Leaves that collect gradients."""
     g = gaussians.detached()
-    return replace(
-        g, means=g.means.requires_grad_(), log_scales=g.log_scales.requires_grad_(),
-        logit_opacities=g.logit_opacities.requires_grad_(), rgb=g.rgb.requires_grad_(),
-    )  # fmt: skip
+    names = [name for name in ('means', 'log_scales', 'logit_opacities', 'rgb', 'rotations') if getattr(g, name) is not None]
+    return replace(g, **{name: getattr(g, name).requires_grad_() for name in names})
 
 
 def backward(render: Render) -> None:
@@ -52,9 +50,10 @@ def backward(render: Render) -> None:
     torch.autograd.backward(outputs, [torch.ones_like(output) for output in outputs])
 
 
-def row(name: str, rasterizer: Rasterizer, cam: PinholeCamera, runs: int) -> None:
+def row(name: str, rasterizer: Rasterizer, cam: PinholeCamera, runs: int, anisotropic: bool = False) -> None:
     """One line of the table: medians and the spread of forward plus backward."""
-    still, moving = wavy_wall(cam), with_gradients(wavy_wall(cam))
+    still = wavy_wall(cam).anisotropic() if anisotropic else wavy_wall(cam)
+    moving = with_gradients(still)
     pose = torch.eye(4)
     pose[0, 3] = 0.003
     forward = timed_ms(lambda: rasterizer.render(still, cam, pose), runs)
@@ -79,6 +78,7 @@ def main() -> None:
             rasterizer = CpuRasterizer(threads)
             name = f'cpu, {rasterizer.instruction_set}, {threads} thread{"s"[: threads - 1]}'
             row(name, rasterizer, camera(*size), runs)
+            row(f'{name}, anisotropic', rasterizer, camera(*size), runs, anisotropic=True)
     small = camera(64, 48)
     for name in ('cpu', 'reference'):
         row(f'{name}, 1 thread', make_rasterizer(name, 1), small, runs)

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING
 
-from splatam_core.commands import bench, compare, convert, evaluate, export, refine, render
+from splatam_core.commands import ablations, bench, compare, convert, evaluate, export, refine, render
 from splatam_core.commands.evaluate import print_summary, score_own_run
 from splatam_core.commands.shared import Command, add_source_arguments, open_source, positive, say, source_of
 from splatam_core.errors import DatasetError, FrameError, RunFolderError, SplatamError
@@ -131,9 +131,9 @@ class _Job:
 
 def _begin(args: argparse.Namespace) -> _Job:
     from splatam_core.config import apply_threads, load_config
+    from splatam_core.offline import prepare
     from splatam_core.resuming import CheckpointWriter
     from splatam_core.run_folder import KEEP_CHECKPOINTS, RunDescription, RunFolder
-    from splatam_core.slam import Slam
 
     if args.source is None or args.out is None:
         make_parser().error('run needs SOURCE and --out DIR, or --resume DIR to go on with one')
@@ -141,11 +141,11 @@ def _begin(args: argparse.Namespace) -> _Job:
     config = load_config(args.preset, [*args.set, *held_out])
     apply_threads(config)
     source = source_of(args)
-    sequence = open_source(source)
+    sequence, slam = prepare(open_source(source), config)
     every, keep = args.checkpoint_every, args.keep_checkpoints or KEEP_CHECKPOINTS
     description = RunDescription('splatam run', args.preset, source, every, keep)
     folder = RunFolder.create(args.out, config, description, overwrite=args.overwrite)
-    return _Job(sequence, 0, Slam(config), folder, CheckpointWriter(folder, len(sequence), every, keep, say))
+    return _Job(sequence, 0, slam, folder, CheckpointWriter(folder, len(sequence), every, keep, say))
 
 
 def _resume(args: argparse.Namespace) -> _Job:
@@ -230,6 +230,7 @@ def _process(job: _Job, stop: _StopRequest) -> DatasetError | None:
 COMMANDS = (
     Command('run', 'run SLAM over a recording', _add_run_arguments, run),
     evaluate.COMMAND,
+    ablations.COMMAND,
     convert.COMMAND,
     compare.COMMAND,
     render.COMMAND,

@@ -101,10 +101,17 @@ class TrackingConfig:
 
     method: str = _setting(
         'render_and_compare',
-        "The paper's Adam through the renderer, Gauss-Newton alignment to one render, or the expected pose as it is.",
-        choices=('render_and_compare', 'align', 'none'),
+        "The paper's Adam through the renderer, Gauss-Newton alignment to one render, the expected pose as it is, or the "
+        "true one (of recordings that have it).",
+        choices=('render_and_compare', 'align', 'none', 'truth'),
     )
     iterations: int = _setting(40, 'Steps per frame; of alignment, at most per resolution.', '', 0)
+    extend_above_m: float = _setting(
+        0.0,
+        "Of the paper's tracker: as many steps again where the depth L1, over the image's pixels, ends above this; 0 = never.",
+        'm', 0.0,
+    )  # fmt: skip
+    scale: float = _setting(1.0, 'Resolution at which frames are tracked, relative to the frame.', '', 0.05, 1.0)
     exposure: bool = _setting(True, "Of alignment: take up changes of the camera's exposure.")
     lag: bool = _setting(True, 'Of alignment: take up that colour and depth of a frame were taken at different times.')
     rotation_rate: float = _setting(4e-4, 'Adam step of the unit quaternion.', '', 0.0)
@@ -113,6 +120,14 @@ class TrackingConfig:
     depth_weight: float = _setting(1.0, 'Weight of the depth L1.', '', 0.0)
     silhouette_threshold: float = _setting(
         0.99, 'Pixels count only where the rendered silhouette is above this.', '', 0.0, 1.0
+    )
+    use_silhouette: bool = _setting(
+        True,
+        "Of the paper's tracker: look at sure map only; off = depth where there is a reading and colour everywhere, "
+        'also where there is no map.',
+    )
+    depth_outlier_ratio: float = _setting(
+        0.0, "Of the paper's tracker: pixels count up to this many median depth errors; 0 = all.", '', 0.0
     )
     motion_model: str = _setting(
         'constant_velocity', 'Where tracking starts from.', choices=('constant_velocity', 'last_pose')
@@ -151,7 +166,17 @@ class KeyframeConfig:
     """Which frames are kept, and which of them are mapped together (paper, section 3.4)."""
 
     every: int = _setting(5, 'Keep every n-th frame.', 'frames', 1)
+    at_least: int = _setting(
+        0, 'Keep more often where a recording is too short to give this many; live the length is not known. 0 = off.', '', 0
+    )
+    before_last: bool = _setting(False, 'Also keep the last frame but one of a recording.')
     window: int = _setting(24, 'Views in a mapping window, the current frame included.', 'frames', 1)
+    selection: str = _setting(
+        'overlap',
+        'Which kept frames fill the window beside the last: random ones that overlap the current frame, those that overlap '
+        'it most, any at random, the latest, or some spread evenly over all.',
+        choices=('overlap', 'most_overlap', 'random', 'latest', 'uniform'),
+    )
     current_share: float = _setting(
         0.0, 'Share of the steps that fit the current frame; 0 = as many as any other view of the window.', '', 0.0, 1.0
     )
@@ -171,6 +196,9 @@ class MappingConfig:
     )
     iterations: int = _setting(60, 'Optimisation steps per mapped frame.', '', 0)
     first_iterations: int = _setting(0, 'More steps on the first frame.', '', 0)
+    anisotropic: bool = _setting(
+        False, 'Gaussians with three radii and a rotation instead of one radius; several times slower. Not with fused fitting.'
+    )
     optimizer: str = _setting(
         'autograd',
         "The paper's: Adam started anew on every mapped frame; or one native step that renders, compares (L1 only) and "
@@ -179,11 +207,15 @@ class MappingConfig:
     )
     color_weight: float = _setting(0.5, 'Weight of the colour loss.', '', 0.0)
     depth_weight: float = _setting(1.0, 'Weight of the depth L1.', '', 0.0)
+    depth_outlier_ratio: float = _setting(
+        0.0, 'Readings count up to this many median depth errors; 0 = all. Not of fused fitting.', '', 0.0
+    )
     ssim_weight: float = _setting(0.2, 'Share of 1 - SSIM in the colour loss; the rest is L1.', '', 0.0, 1.0)
     means_rate: float = _setting(1e-4, 'Adam step of the centres.', 'm', 0.0)
     rgb_rate: float = _setting(2.5e-3, 'Adam step of the colours.', '', 0.0)
     opacity_rate: float = _setting(0.05, 'Adam step of the opacity logits.', '', 0.0)
     scale_rate: float = _setting(1e-3, 'Adam step of the log scales.', '', 0.0)
+    rotation_rate: float = _setting(1e-3, "Adam step of anisotropic Gaussians' unit quaternions.", '', 0.0)
     prune_every: int = _setting(20, 'Prune before every n-th step of a frame; 0 = never.', 'steps', 0)
     prune_until: int = _setting(20, 'Last step of a frame that may prune.', 'steps', 0)
     prune_opacity: float = _setting(0.005, 'Prune Gaussians fainter than this.', '', 0.0, 1.0)
@@ -245,9 +277,27 @@ def load_config(preset: str | None = None, overrides: Mapping[str, object] | Ite
     Raises:
         ConfigError: an unknown preset or key, or a value that is not allowed.
     """
-    values = {} if preset is None else _flatten(_read_preset(preset), '')
-    values |= overrides if isinstance(overrides, Mapping) else dict(map(_parse_override, overrides))
+    values = {} if preset is None else read_values(preset)
+    values |= overrides if isinstance(overrides, Mapping) else parse_overrides(overrides)
     return with_values(SlamConfig(), values)
+
+
+def read_values(preset: str) -> dict[str, object]:
+    """What a preset or YAML file sets: dotted names to values, unchecked.
+
+    Raises:
+        ConfigError: there is no such preset, or the file is no mapping.
+    """
+    return _flatten(_read_preset(preset), '')
+
+
+def parse_overrides(texts: Iterable[str]) -> dict[str, object]:
+    """Texts ``name=value`` as dotted names to values, unchecked.
+
+    Raises:
+        ConfigError: a text is not of that form.
+    """
+    return dict(map(_parse_override, texts))
 
 
 def with_values(config: SlamConfig, values: Mapping[str, object]) -> SlamConfig:
@@ -265,6 +315,13 @@ def with_values(config: SlamConfig, values: Mapping[str, object]) -> SlamConfig:
         raise ConfigError(f'depth.min_m = {config.depth.min_m:g}: expected less than depth.max_m = {config.depth.max_m:g}')
     if config.mapping.hold_out == 1:
         raise ConfigError('mapping.hold_out = 1: would leave no frame for the map; expected 0 (none) or at least 2')
+    if config.mapping.optimizer == 'fused' and config.mapping.anisotropic:
+        raise ConfigError(
+            'mapping.anisotropic = true: fused fitting knows isotropic Gaussians only; set it to false, or '
+            'mapping.optimizer=autograd'
+        )
+    if config.mapping.optimizer == 'fused' and config.mapping.depth_outlier_ratio > 0:
+        raise ConfigError('mapping.depth_outlier_ratio: fused fitting has none; set it to 0, or mapping.optimizer=autograd')
     return config
 
 

@@ -11,37 +11,45 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from splatam_core.rasterizer import Gaussians, Moments, Rates
-from splatam_core.rasterizer.base import BETA_1, BETA_2, BLOCK, EPSILON
+from splatam_core.rasterizer.base import BETA_1, BETA_2, BLOCK, EPSILON, check_isotropic
 from splatam_core.types import MapSnapshot
 
 PARAMETERS = ('means', 'log_scales', 'logit_opacities', 'rgb')
+ROTATIONS = 'rotations'  # one more parameter of anisotropic maps
 BOUNDS = 'bounds'
 
 
 class GaussianMap:
-    """Isotropic Gaussians in world coordinates.
+    """Gaussians in world coordinates, all isotropic or all anisotropic.
 
     Only ``append`` and ``keep`` change how many there are; ``keep`` takes the optimiser's moments along. There is room for
     more than there are, so that a growing map is not copied each time.
 
     Attributes:
         means: [N, 3] metres.
-        log_scales: [N, 1] log metres.
+        log_scales: [N, 1] log metres; [N, 3] when anisotropic.
         logit_opacities: [N].
         rgb: [N, 3], nominally in [0, 1].
+        rotations: [N, 4] as ``Gaussians`` has them; None when isotropic.
     """
 
     means: Tensor
     log_scales: Tensor
     logit_opacities: Tensor
     rgb: Tensor
+    rotations: Tensor | None
 
-    def __init__(self) -> None:
+    def __init__(self, anisotropic: bool = False) -> None:
         self._size = 0
+        self._names = (*PARAMETERS, ROTATIONS) if anisotropic else PARAMETERS
         self._room = {
-            'means': torch.empty(0, 3), 'log_scales': torch.empty(0, 1), 'logit_opacities': torch.empty(0),
-            'rgb': torch.empty(0, 3), 'first_second': torch.empty(0, 16), 'steps': torch.empty(0, dtype=torch.uint8),
+            'means': torch.empty(0, 3), 'log_scales': torch.empty(0, 3 if anisotropic else 1),
+            'logit_opacities': torch.empty(0), 'rgb': torch.empty(0, 3),
+            'first_second': torch.empty(0, 16), 'steps': torch.empty(0, dtype=torch.uint8),
         }  # fmt: skip
+        if anisotropic:
+            self._room[ROTATIONS] = torch.empty(0, 4)
+        self.rotations = None
         self._bounds = torch.empty(0, 7)
         self._optimizer: torch.optim.Adam | None = None
         self._show()
@@ -60,10 +68,15 @@ class GaussianMap:
         return self._size
 
     @property
+    def is_anisotropic(self) -> bool:
+        """Whether its Gaussians have three radii and a rotation."""
+        return ROTATIONS in self._room
+
+    @property
     def gaussians(self) -> Gaussians:
         """The parameters themselves, as a rasterizer takes them; they carry gradients while being optimised."""
         bounds = self._bounds if self._optimizer is None else None
-        return Gaussians(self.means, self.log_scales, self.logit_opacities, self.rgb, bounds)
+        return Gaussians(self.means, self.log_scales, self.logit_opacities, self.rgb, bounds, self.rotations)
 
     @property
     def moments(self) -> Moments:
@@ -71,11 +84,19 @@ class GaussianMap:
         return Moments(self._room['first_second'][: self._size], self._room['steps'][: self._size])
 
     def append(self, new: Gaussians) -> None:
-        """Add Gaussians. Ends an optimisation that was under way."""
+        """Add Gaussians. Ends an optimisation that was under way.
+
+        Raises:
+            RasterizerError: anisotropic ones, to an isotropic map.
+        """
         self.stop_optimization()
+        if self.is_anisotropic:
+            new = new.anisotropic()
+        else:
+            check_isotropic(new)
         old_size, self._size = self._size, self._size + len(new)
         self._make_room()
-        for name in PARAMETERS:
+        for name in self._names:
             self._room[name][old_size : self._size] = getattr(new, name)
         for name in ('first_second', 'steps'):
             self._room[name][old_size : self._size] = 0
@@ -84,14 +105,14 @@ class GaussianMap:
 
     def keep(self, kept: Tensor) -> None:
         """Drop all Gaussians but those where ``kept`` [N] is true; gradients and moments of the others stay."""
-        old = {name: getattr(self, name) for name in PARAMETERS}
+        old = {name: getattr(self, name) for name in self._names}
         size, self._size = self._size, int(kept.sum())
         for values in self._room.values():
             values[: self._size] = values[:size][kept]
         self._show()
         self._measure(0)
         if self._optimizer is not None:
-            for name in PARAMETERS:
+            for name in self._names:
                 new = getattr(self, name).requires_grad_()
                 new.grad = None if old[name].grad is None else old[name].grad[kept]
                 _replace_parameter(self._optimizer, old[name], new, kept)
@@ -99,13 +120,13 @@ class GaussianMap:
     def start_optimization(self, rates: Rates) -> None:
         """Begin with fresh moments, as the paper does for every frame."""
         self._show()
-        groups = [{'params': [getattr(self, name).requires_grad_()], 'lr': getattr(rates, name)} for name in PARAMETERS]
+        groups = [{'params': [getattr(self, name).requires_grad_()], 'lr': getattr(rates, name)} for name in self._names]
         self._optimizer = torch.optim.Adam(groups, betas=(BETA_1, BETA_2), eps=EPSILON, fused=True)
 
     def set_rates(self, rates: Rates) -> None:
         """Go on with other step sizes."""
         assert self._optimizer is not None
-        for group, name in zip(self._optimizer.param_groups, PARAMETERS):
+        for group, name in zip(self._optimizer.param_groups, self._names):
             group['lr'] = getattr(rates, name)
 
     def step(self) -> None:
@@ -129,6 +150,7 @@ class GaussianMap:
                 self.rgb.numpy(force=True).copy(),
                 torch.sigmoid(self.logit_opacities).numpy(force=True),
                 self.log_scales.numpy(force=True).copy(),
+                None if self.rotations is None else self.rotations.numpy(force=True).copy(),
             )
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -157,7 +179,7 @@ class GaussianMap:
 
     def _show(self) -> None:
         """Let the parameters be the used part of the room, without gradients."""
-        for name in PARAMETERS:
+        for name in self._names:
             setattr(self, name, self._room[name][: self._size])
 
     def _make_room(self) -> None:
@@ -177,6 +199,7 @@ class GaussianMap:
             self._bounds = self._bounds[:first_block]
             return
         means, log_scales = self.means[begin:].detach().numpy(), self.log_scales[begin:].detach().numpy()
+        log_scales = log_scales.max(axis=1, keepdims=True)
         measured = np.concatenate(
             [np.minimum.reduceat(means, starts), np.maximum.reduceat(means, starts), np.maximum.reduceat(log_scales, starts)],
             axis=1,

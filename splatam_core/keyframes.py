@@ -1,4 +1,4 @@
-"""Which views are mapped together: some that overlap the current one, the last keyframe, the current one."""
+"""Which views are kept, and which are mapped together: some keyframes, the last keyframe, the current view."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from splatam_core.config import KeyframeConfig
@@ -29,18 +30,76 @@ class PosedView:
 def select_window(
     current: PosedView, keyframes: Sequence[PosedView], config: KeyframeConfig, rng: np.random.Generator
 ) -> list[PosedView]:
-    """The views to map: random overlapping keyframes, the last keyframe and the current view.
+    """The views to map: some keyframes by the configured selection, the last keyframe and the current view.
 
-    Random, not best: the most overlapping keyframes are nearly the current view, and the map would forget the rest.
+    By default random ones that overlap, not the best: those are nearly the current view, and the map would forget the rest.
     """
     if not keyframes or config.window == 1:
         return [current]
+    *earlier, last = keyframes
+    count = max(0, config.window - 2)
+    chosen = _SELECTIONS[config.selection](current, earlier, count, config, rng)
+    return [*(earlier[i] for i in chosen), last, current]
+
+
+def _overlapping(
+    current: PosedView, keyframes: Sequence[PosedView], count: int, config: KeyframeConfig, rng: np.random.Generator
+) -> list[int]:
+    overlapping = np.flatnonzero(_seen(current, keyframes, config, rng))
+    return list(overlapping[rng.permutation(len(overlapping))[:count]])
+
+
+def _most_overlapping(
+    current: PosedView, keyframes: Sequence[PosedView], count: int, config: KeyframeConfig, rng: np.random.Generator
+) -> list[int]:
+    seen = _seen(current, keyframes, config, rng)
+    best = np.argsort(-seen, kind='stable')[:count]
+    return list(best[seen[best] > 0])
+
+
+def _random(
+    current: PosedView, keyframes: Sequence[PosedView], count: int, config: KeyframeConfig, rng: np.random.Generator
+) -> list[int]:
+    return list(rng.permutation(len(keyframes))[:count])
+
+
+def _latest(
+    current: PosedView, keyframes: Sequence[PosedView], count: int, config: KeyframeConfig, rng: np.random.Generator
+) -> list[int]:
+    return list(range(max(0, len(keyframes) - count), len(keyframes)))
+
+
+def _uniform(
+    current: PosedView, keyframes: Sequence[PosedView], count: int, config: KeyframeConfig, rng: np.random.Generator
+) -> list[int]:
+    return list(np.unique(np.linspace(0, len(keyframes) - 1, min(count, len(keyframes))).round().astype(int)))
+
+
+_SELECTIONS = {
+    'overlap': _overlapping, 'most_overlap': _most_overlapping, 'random': _random, 'latest': _latest, 'uniform': _uniform,
+}  # fmt: skip
+
+
+def is_due(index: int, config: KeyframeConfig, num_frames: int | None) -> bool:
+    """Whether a frame is to be kept.
+
+    Args:
+        index: its number, from 0.
+        config: how often.
+        num_frames: of the recording, where that is known.
+    """
+    every = config.every
+    if num_frames is not None and config.at_least:
+        every = min(every, max(1, num_frames // config.at_least))
+    before_last = config.before_last and num_frames is not None and index == num_frames - 2
+    return index % every == 0 or before_last
+
+
+def _seen(
+    current: PosedView, keyframes: Sequence[PosedView], config: KeyframeConfig, rng: np.random.Generator
+) -> NDArray[np.float64]:
     points = sample_points(current, config.overlap_samples, rng)
-    seen = overlaps(points, keyframes[:-1], config.overlap_margin)
-    overlapping = [k for k, share in zip(keyframes, seen) if share > 0]
-    count = min(max(0, config.window - 2), len(overlapping))
-    chosen = rng.permutation(len(overlapping))[:count]
-    return [*(overlapping[i] for i in chosen), keyframes[-1], current]
+    return np.array(overlaps(points, keyframes, config.overlap_margin))
 
 
 def sample_points(posed: PosedView, count: int, rng: np.random.Generator) -> Tensor:

@@ -9,6 +9,7 @@ import cv2
 import torch
 from torch import Tensor
 
+from splatam_core.config import MappingConfig, TrackingConfig
 from splatam_core.rasterizer import Render
 from splatam_core.view import View
 
@@ -21,22 +22,34 @@ class TrackingLoss:
 
     Attributes:
         total: sum over the pixels that count, differentiable.
+        depth: the part of depth, unweighted, metres times pixels.
         num_pixels: how many count.
     """
 
     total: Tensor
+    depth: Tensor
     num_pixels: int
 
 
-def tracking_loss(
-    render: Render, view: View, silhouette_threshold: float, color_weight: float, depth_weight: float
-) -> TrackingLoss:
-    """Summed L1 of depth and colour where the map is sure and the sensor has a reading (paper, eq. 8)."""
-    counts = (render.silhouette.detach() > silhouette_threshold) & view.valid
+def tracking_loss(render: Render, view: View, config: TrackingConfig) -> TrackingLoss:
+    """Summed L1 of depth and colour where the map is sure and the sensor has a reading (paper, eq. 8).
+
+    Without the silhouette's mask depth counts at every reading, and colour at every pixel, map or not.
+    """
+    counts = view.valid & (render.silhouette.detach() > config.silhouette_threshold) if config.use_silhouette else view.valid
+    error = (expected_depth(render) - view.depth).abs()
+    if config.depth_outlier_ratio > 0:
+        counts = counts & inliers(error.detach(), counts, config.depth_outlier_ratio)
     mask = counts.to(view.rgb.dtype)
-    depth = ((expected_depth(render) - view.depth).abs() * mask).sum()
-    color = ((render.rgb - view.rgb).abs() * mask).sum()
-    return TrackingLoss(depth_weight * depth + color_weight * color, int(counts.sum()))
+    depth = (error * mask).sum()
+    difference = (render.rgb - view.rgb).abs()
+    color = (difference * mask).sum() if config.use_silhouette or config.depth_outlier_ratio > 0 else difference.sum()
+    return TrackingLoss(config.depth_weight * depth + config.color_weight * color, depth.detach(), int(counts.sum()))
+
+
+def inliers(error: Tensor, counts: Tensor, ratio: float) -> Tensor:
+    """[H, W] where an error is at most so many times the median of those that count."""
+    return error <= ratio * error[counts].median() if counts.any() else counts
 
 
 def expected_depth(render: Render) -> Tensor:
@@ -44,14 +57,16 @@ def expected_depth(render: Render) -> Tensor:
     return render.depth_acc / render.silhouette.clamp(min=0.5)
 
 
-def mapping_loss(render: Render, view: View, ssim_weight: float, color_weight: float, depth_weight: float) -> Tensor:
+def mapping_loss(render: Render, view: View, config: MappingConfig) -> Tensor:
     """Mean L1 of depth over readings, and L1 with SSIM of colour over the image (paper, section 3.4)."""
-    readings = view.valid.sum().clamp(min=1)
-    depth = ((render.depth_acc - view.depth).abs() * view.valid).sum() / readings
-    color = (1 - ssim_weight) * (render.rgb - view.rgb).abs().mean()
-    if ssim_weight > 0:
-        color = color + ssim_weight * (1 - ssim_map(render.rgb, view.rgb).mean())
-    return depth_weight * depth + color_weight * color
+    error, counts = (render.depth_acc - view.depth).abs(), view.valid
+    if config.depth_outlier_ratio > 0:
+        counts = counts & inliers(error.detach(), counts, config.depth_outlier_ratio)
+    depth = (error * counts).sum() / counts.sum().clamp(min=1)
+    color = (1 - config.ssim_weight) * (render.rgb - view.rgb).abs().mean()
+    if config.ssim_weight > 0:
+        color = color + config.ssim_weight * (1 - ssim_map(render.rgb, view.rgb).mean())
+    return config.depth_weight * depth + config.color_weight * color
 
 
 def ssim_map(a: Tensor, b: Tensor) -> Tensor:

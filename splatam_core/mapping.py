@@ -42,7 +42,7 @@ def refine(
 
 def rates(config: MappingConfig) -> Rates:
     """Adam's."""
-    return Rates(config.means_rate, config.scale_rate, config.opacity_rate, config.rgb_rate)
+    return Rates(config.means_rate, config.scale_rate, config.opacity_rate, config.rgb_rate, config.rotation_rate)
 
 
 def _fit_by_autograd(
@@ -52,7 +52,7 @@ def _fit_by_autograd(
     gaussian_map.start_optimization(rates(config))
     for step, posed in enumerate(views):
         render = rasterizer.render(gaussian_map.gaussians, posed.view.camera, posed.T_cam_world)
-        mapping_loss(render, posed.view, config.ssim_weight, config.color_weight, config.depth_weight).backward()
+        mapping_loss(render, posed.view, config).backward()
         if config.prune_every and step % config.prune_every == 0 and step <= config.prune_until:
             gaussian_map.keep(~prunable(gaussian_map, config, scene_radius))
         gaussian_map.step()

@@ -67,7 +67,9 @@ def _columns(gaussians: Gaussians) -> dict[str, NDArray[np.float64]]:
     columns = dict(zip('xyz', means.T))
     columns |= {f'f_dc_{c}': (rgb[:, c] - 0.5) / SH_C0 for c in range(3)}
     columns |= {'opacity': logits, 'rot_0': np.ones(len(means))}
-    return columns | dict.fromkeys(SCALES, log_scales[:, 0])
+    if g.rotations is not None:
+        columns |= dict(zip(ROTATION, g.rotations.cpu().numpy().astype(np.float64).T))
+    return columns | dict(zip(SCALES, np.broadcast_to(log_scales, (len(means), 3)).T))
 
 
 def write_surface(
@@ -101,16 +103,16 @@ def write_surface(
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Read a map of isotropic Gaussians.
+    """Read a map; where each Gaussian's three scales are equal, as one of isotropic Gaussians.
 
     Higher spherical-harmonics coefficients (colour that depends on the direction) are left out.
 
     Returns:
-        float32 tensors, ``log_scales`` of shape [N, 1].
+        float32 tensors.
 
     Raises:
-        MapFileError: the file cannot be read, is no such PLY, is cut short, or holds a number that is not finite
-            or Gaussians that are not isotropic.
+        MapFileError: the file cannot be read, is no such PLY, is cut short, or holds a number that is not finite,
+            or anisotropic Gaussians without rotations.
     """
     try:
         with path.open('rb') as file:
@@ -120,13 +122,18 @@ def read_ply(path: Path) -> Gaussians:
         raise MapFileError(f'{path}: cannot be read: {error.strerror}') from None
     except ValueError as error:
         raise MapFileError(f'{path}: {error}') from None
-    values = {name: rows[name].astype(np.float32) for name in NEEDED}
+    is_anisotropic = any((rows[SCALES[0]] != rows[other]).any() for other in SCALES[1:])
+    names = (*NEEDED, *(name for name in ROTATION if is_anisotropic and name in header.row.names))
+    values = {name: rows[name].astype(np.float32) for name in names}
     _check_values(path, values)
+    if is_anisotropic:
+        _check_rotations(path, values)
     return Gaussians(
         means=_tensor(values, ('x', 'y', 'z')),
-        log_scales=_tensor(values, SCALES[:1]),
+        log_scales=_tensor(values, SCALES if is_anisotropic else SCALES[:1]),
         logit_opacities=torch.from_numpy(values['opacity']),
         rgb=_tensor(values, ('f_dc_0', 'f_dc_1', 'f_dc_2')) * SH_C0 + 0.5,
+        rotations=_tensor(values, ROTATION) if is_anisotropic else None,
     )
 
 
@@ -180,9 +187,14 @@ def _check_values(path: Path, values: dict[str, NDArray[np.float32]]) -> None:
     finite = np.all([np.isfinite(column) for column in values.values()], axis=0)
     if not finite.all():
         raise MapFileError(f'{path}: {int((~finite).sum())} of {len(finite)} Gaussians hold NaN or infinity')
-    first, *others = (values[name] for name in SCALES)
-    if any((first != other).any() for other in others):
-        raise MapFileError(f'{path}: scale_0, scale_1 and scale_2 differ: only isotropic Gaussians are read')
+
+
+def _check_rotations(path: Path, values: dict[str, NDArray[np.float32]]) -> None:
+    if missing := [name for name in ROTATION if name not in values]:
+        raise MapFileError(f'{path}: scale_0, scale_1 and scale_2 differ, so rotations are needed; no property {", ".join(missing)}')
+    without = ~np.any([values[name] for name in ROTATION], axis=0)
+    if without.any():
+        raise MapFileError(f'{path}: {int(without.sum())} of {len(without)} Gaussians have a quaternion of length zero')
 
 
 def _tensor(values: dict[str, NDArray[np.float32]], names: tuple[str, ...]) -> torch.Tensor:

@@ -12,6 +12,7 @@ from splatam_core import environment
 from splatam_core.checkpoints import Checkpoint, Checkpoints, Progress, read_newest
 from splatam_core.config import SlamConfig, flat_values
 from splatam_core.errors import CheckpointError
+from splatam_core.offline import prepare
 from splatam_core.run_folder import CHECKPOINTS, RunFolder, RunSettings, read_run, read_settings, trim_run
 from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame
@@ -108,9 +109,9 @@ def resume(
     checkpoint = read_newest(path / CHECKPOINTS)
     _check_settings(settings, checkpoint)
     begin(settings.config)
-    sequence = open_source(settings.description.source)
+    sequence, slam = prepare(open_source(settings.description.source), settings.config)
     _check_frames(sequence, checkpoint)
-    slam = _restored(settings.config, checkpoint)
+    _restore(slam, checkpoint)
     if settings.commit != (commit := environment.commit()):
         say(f'{path} was begun by commit {settings.commit} and goes on by {commit}: the result may differ from either')
     trim_run(path, checkpoint.progress.num_lines, checkpoint.state.last_stamp_ns)
@@ -153,10 +154,8 @@ def _check_frames(sequence: FrameSequence, checkpoint: Checkpoint) -> None:
     )
 
 
-def _restored(config: SlamConfig, checkpoint: Checkpoint) -> Slam:
-    slam = Slam(config)
+def _restore(slam: Slam, checkpoint: Checkpoint) -> None:
     try:
         slam.restore(checkpoint.state)
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f'{checkpoint.path}: does not fit its own settings: {error}') from None
-    return slam

@@ -14,9 +14,9 @@ from splatam_core.camera import PinholeCamera
 from splatam_core.checkpoints import SlamState
 from splatam_core.config import SlamConfig
 from splatam_core.densification import densify
-from splatam_core.errors import FrameError, SplatamError
+from splatam_core.errors import ConfigError, FrameError, SplatamError
 from splatam_core.gaussian_map import GaussianMap
-from splatam_core.keyframes import PosedView, select_window
+from splatam_core.keyframes import PosedView, is_due, select_window
 from splatam_core.mapping import refine
 from splatam_core.motion import MotionModel, MotionPrior
 from splatam_core.rasterizer import Gaussians, make_rasterizer
@@ -30,19 +30,34 @@ Matrix = NDArray[np.float64]
 class Slam:
     """The algorithm, synchronous and without threads of its own."""
 
-    def __init__(self, config: SlamConfig, motion_prior: MotionPrior | None = None) -> None:
+    def __init__(
+        self, config: SlamConfig, motion_prior: MotionPrior | None = None, *,
+        true_motion: MotionPrior | None = None, num_frames: int | None = None,
+    ) -> None:  # fmt: skip
+        """Begin with an empty map.
+
+        Args:
+            config: all settings.
+            motion_prior: how another sensor saw the camera move.
+            true_motion: how the camera truly moved, for ``tracking.method: truth``; known for every frame.
+            num_frames: how many frames will come, where that is known.
+
+        Raises:
+            ConfigError: the true poses are asked for, and are not there.
+        """
+        check_truth(config, true_motion)
         self.config = config
-        self._motion_prior = motion_prior
+        self._motion_prior, self._true_motion, self._all_frames = motion_prior, true_motion, num_frames
         self._rasterizer = make_rasterizer(config.rasterizer, config.threads)
         self._tracker = make_tracker(self._rasterizer, config.tracking, config.threads)
         self.reset()
 
     def reset(self) -> None:
         """Forget map, poses and camera; the next frame starts a new world."""
-        self.map = GaussianMap()
+        self.map = GaussianMap(self.config.mapping.anisotropic)
         self.camera: PinholeCamera | None = None
         self._keyframes: list[PosedView] = []
-        self._motion = MotionModel(self.config.tracking.motion_model == 'constant_velocity', self._motion_prior)
+        self._motion = self._motion_model()
         self._rng = np.random.default_rng(self.config.seed)
         self._scene_radius = 0.0
         self._num_frames = 0
@@ -68,7 +83,8 @@ class Slam:
 
         guess = se3.inverse(self._motion.predict(frame.stamp_ns))
         before = se3.inverse(self._motion.last_pose)
-        tracking = self._tracker.track(view, self.map.gaussians, guess, before)
+        view_to_track = view.scaled(self.config.tracking.scale)
+        tracking = self._tracker.track(view_to_track, self.map.gaussians, guess, before)
         clock.lap('track')
         if tracking.failure:
             self._motion.stop()
@@ -83,7 +99,12 @@ class Slam:
                             tracking.sure_fraction, tracking.inlier_fraction)  # fmt: skip
 
     def configure(self, config: SlamConfig) -> None:
-        """Use other settings from the next frame on; seed, threads, rasterizer and motion model stay as they are."""
+        """Use other settings from the next frame on; seed, threads, rasterizer and motion model stay as they are.
+
+        Raises:
+            ConfigError: the true poses are asked for, and are not there.
+        """
+        check_truth(config, self._true_motion)
         self.config = config
         self._tracker = make_tracker(self._rasterizer, config.tracking, config.threads)
 
@@ -93,7 +114,12 @@ class Slam:
         Args:
             gaussians: the map.
             T_world_cam: [4, 4] about where the camera is in it.
+
+        Raises:
+            ConfigError: they are anisotropic, and the configuration is not.
         """
+        if gaussians.rotations is not None and not self.config.mapping.anisotropic:
+            raise ConfigError('the map is of anisotropic Gaussians: set mapping.anisotropic=true')
         self.reset()
         self.map.append(gaussians)
         self._motion.place(T_world_cam)
@@ -183,10 +209,15 @@ class Slam:
             more = config.mapping.first_iterations if index == 0 else 0
             refine(self.map, window, self._rasterizer, config, self._scene_radius, self._rng, more)
             clock.lap('map')
-        is_keyframe = index % config.keyframes.every == 0
+        is_keyframe = is_due(index, config.keyframes, self._all_frames)
         if is_keyframe:
             self._keyframes.append(replace(current, view=replace(current.view)))  # leaves behind what the view has cached
         return is_keyframe
+
+    def _motion_model(self) -> MotionModel:
+        if self.config.tracking.method == 'truth':
+            return MotionModel(False, self._true_motion)
+        return MotionModel(self.config.tracking.motion_model == 'constant_velocity', self._motion_prior)
 
     def _result(
         self, index: int, frame: RgbdFrame, status: Status, T_world_cam: Matrix | None, is_keyframe: bool,
@@ -196,6 +227,19 @@ class Slam:
             index, frame.stamp_ns, status, T_world_cam, is_keyframe, self.num_gaussians,
             sure_fraction, inlier_fraction, reason, clock.timings(),
         )  # fmt: skip
+
+
+def check_truth(config: SlamConfig, true_motion: MotionPrior | None) -> None:
+    """Make sure that true poses are there where they are asked for.
+
+    Raises:
+        ConfigError: they are not.
+    """
+    if config.tracking.method == 'truth' and true_motion is None:
+        raise ConfigError(
+            "tracking.method = truth: there are no true poses here; only 'splatam run' on a recording that has them takes it. "
+            'Choose render_and_compare or align'
+        )
 
 
 def _posed(view: View, T_cam_world: Matrix) -> PosedView:

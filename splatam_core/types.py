@@ -103,13 +103,15 @@ class MapSnapshot:
         means: [N, 3] float32 metres, world.
         rgb: [N, 3] float32, nominally in [0, 1].
         opacities: [N] float32 in (0, 1).
-        log_scales: [N, 1] float32, log metres (isotropic).
+        log_scales: [N, 1] float32, log metres; [N, 3] of anisotropic Gaussians.
+        rotations: [N, 4] float32 quaternions (w, x, y, z) of any length, axes to world; None of isotropic Gaussians.
     """
 
     means: NDArray[np.float32]
     rgb: NDArray[np.float32]
     opacities: NDArray[np.float32]
     log_scales: NDArray[np.float32]
+    rotations: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -158,6 +158,7 @@ FIXED = {
     'slam.threads': 'the threads are running',
     'slam.rasterizer': 'it is made when the node starts',
     'slam.tracking.motion_model': 'it is made when the map starts',
+    'slam.mapping.anisotropic': 'the map is made of the one kind or of the other',
     'slam.mapping.mode': 'the threads are running',
     'slam.mapping.hold_out': 'frames are told apart by it when the run is scored',
     'slam.mapping.scene_radius_ratio': 'it is read when the map starts',

@@ -13,6 +13,7 @@ from rclpy.parameter import Parameter
 from splatam_core.config import SlamConfig, with_values
 from splatam_core.errors import ConfigError, SplatamError
 from splatam_core.run_folder import check_is_free
+from splatam_core.slam import check_truth
 from splatam_ros.parameters import NODE_SETTINGS, SLAM, NodeOptions, field_name, why_fixed
 from splatam_ros.session import load_pose
 
@@ -52,7 +53,8 @@ class Reconfiguration:
         try:
             for change in changes:
                 _check_may_change(change.name)
-            options, _ = self._changed(changes)
+            options, config = self._changed(changes)
+            check_truth(config, None)
             if options.save_path != self.options.save_path:
                 check_save_path(options)
             load_pose(options)

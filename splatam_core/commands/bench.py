@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from splatam_core.commands.compare import compare_runs
-from splatam_core.commands.shared import Command, add_source_arguments, source_of
+from splatam_core.commands.shared import Command, add_source_arguments, source_of, source_words
 from splatam_core.errors import RunFolderError
 
 
@@ -47,7 +47,7 @@ def bench(args: argparse.Namespace) -> int:
             '-m',
             'splatam_core.cli',
             'run',
-            *_source_words(args),
+            *source_words(source_of(args)),
             '--preset',
             preset,
             '--out',
@@ -61,18 +61,6 @@ def bench(args: argparse.Namespace) -> int:
     print()
     compare_runs(folders, args.out / 'compare.png')
     return 0
-
-
-def _source_words(args: argparse.Namespace) -> list[str]:
-    """The arguments that name the recording, as they are typed."""
-    source = source_of(args)
-    given = {
-        '--format': source.format, '--start': source.start, '--max-frames': source.max_frames, '--stride': source.stride,
-        '--width': source.width, '--crop': source.crop, '--split': source.split, '--rgb': source.rgb,
-        '--depth': source.depth, '--info': source.info,
-    }  # fmt: skip
-    words = [str(word) for name, value in given.items() if value is not None for word in (name, value)]
-    return [source.path, *words, *(['--skip-bad'] if source.skip_bad else [])]
 
 
 COMMAND = Command('bench', 'run presets one after another and compare them', _add_arguments, bench)

@@ -67,6 +67,17 @@ def source_of(args: argparse.Namespace) -> Source:
     )  # fmt: skip
 
 
+def source_words(source: Source) -> list[str]:
+    """The arguments that name a source, as they are typed."""
+    given = {
+        '--format': source.format, '--start': source.start, '--max-frames': source.max_frames, '--stride': source.stride,
+        '--width': source.width, '--crop': source.crop, '--split': source.split, '--rgb': source.rgb,
+        '--depth': source.depth, '--info': source.info,
+    }  # fmt: skip
+    words = [str(word) for name, value in given.items() if value is not None for word in (name, value)]
+    return [source.path, *words, *(['--skip-bad'] if source.skip_bad else [])]
+
+
 def open_source(source: Source) -> Sequence:
     """Open a recording.
 

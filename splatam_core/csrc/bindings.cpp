@@ -4,6 +4,7 @@
 #include <pybind11/stl.h>
 
 #include "aligner.hpp"
+#include "blender_bindings.hpp"
 #include "engine.hpp"
 
 namespace py = pybind11;
@@ -138,4 +139,5 @@ PYBIND11_MODULE(_native, module) {
       .def("linearize", &linearize)
       .def("halve", &halve)
       .def("layers", &layers);
+  bind_blender(module);
 }

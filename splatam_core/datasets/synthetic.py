@@ -2,7 +2,7 @@
 
 SOURCE is ``synthetic``, or ``synthetic:`` and options with commas between::
 
-    synthetic:seed=3,noise=off,frames=600
+    synthetic:seed=3,noise=off,frames=600,motion=fast
 
 ``seed``
     Which room and which walk through it (default 0). Frame i of a seed is the same whatever else is
@@ -12,6 +12,12 @@ SOURCE is ``synthetic``, or ``synthetic:`` and options with commas between::
 ``frames``
     Length (default: as far as ``--max-frames`` asks, else 300). The walk closes its loop every 300
     frames and then goes on along nearly the same way.
+``motion``
+    ``calm`` (default): a hand that looks around one side of the room. ``fast``: one that turns all the
+    way round in 120 frames, by 1 degree from frame to frame at the start and by 5 after 30 frames, so that
+    parts of the room that were never seen come into view all the time. That is soon farther than preset ``splatam`` can turn in a
+    frame's 40 steps (2 x 40 x 4e-4 rad = 1.8 degrees) unless it predicts the motion, and changes so
+    slowly that a prediction at constant velocity is within half a degree.
 
 Frames are 640x480 unless ``--width`` says otherwise, which renders at that size instead of resizing.
 There is no motion blur and no noise in the colours.
@@ -31,22 +37,26 @@ from splatam_core.errors import DatasetError
 from splatam_core.types import RgbdFrame, Trajectory
 
 CAMERA = PinholeCamera(640, 480, 525.0, 525.0, 319.5, 239.5)
-LOOP_FRAMES = 300
+MOTIONS = {'calm': 300, 'fast': 120}
+"""Name of a motion to the frames its loop takes."""
+LOOP_FRAMES = MOTIONS['calm']
 SCHEME = 'synthetic'
+OPTIONS = 'seed=N, noise=on|off, frames=N, motion=calm|fast'
 
 
 class SyntheticSequence:
     """As many frames as asked of one walk through one room."""
 
     def __init__(
-        self, *, seed: int = 0, noise: bool = True, frames: int = LOOP_FRAMES, width: int | None = None
-    ) -> None:
-        self.name = f'{SCHEME}_{seed}'
+        self, *, seed: int = 0, noise: bool = True, frames: int = LOOP_FRAMES, width: int | None = None,
+        motion: str = 'calm',
+    ) -> None:  # fmt: skip
+        self.name = f'{SCHEME}_{seed}' if motion == 'calm' else f'{SCHEME}_{seed}_{motion}'
         self.camera = FrameFactory(CameraCalibration(CAMERA), width).camera
         self.depth_scale: float | None = 1000.0 if noise else None
         self._seed = seed
         self._frames = range(frames)
-        self._walk = Walk.of(seed)
+        self._walk = Walk.of(seed, motion)
         self._room = build_room(seed)
 
     def __len__(self) -> int:
@@ -75,29 +85,35 @@ class Walk:
     """A hand-held camera's way: one loop through the room that looks around, and a hand that is never still.
 
     Attributes:
+        motion: one of ``MOTIONS``.
         phases: [4] radians, where on its way the camera begins.
         tremor_hz: [6, 3] frequencies of the hand's motion along x, y, z and about yaw, pitch, roll.
         tremor_phases: [6, 3] radians.
     """
 
+    motion: str
     phases: NDArray[np.float64]
     tremor_hz: NDArray[np.float64]
     tremor_phases: NDArray[np.float64]
 
     @classmethod
-    def of(cls, seed: int) -> Walk:
+    def of(cls, seed: int, motion: str = 'calm') -> Walk:
         """The walk of a seed."""
         rng = np.random.default_rng([seed, 0])
         turn = 2 * np.pi
-        return cls(rng.uniform(0, turn, 4), rng.uniform(0.4, 2.2, (6, 3)), rng.uniform(0, turn, (6, 3)))
+        phases = rng.uniform(0, turn, 4)
+        if motion == 'fast':
+            phases[2] = np.pi / 2 if phases[2] < np.pi else 3 * np.pi / 2  # where it turns slowest
+        return cls(motion, phases, rng.uniform(0.4, 2.2, (6, 3)), rng.uniform(0, turn, (6, 3)))
 
     def pose(self, frame: int) -> NDArray[np.float64]:
-        """[4, 4] camera to world. At most about 0.35 m/s and 25 degrees/s."""
-        around = 2 * np.pi * frame / LOOP_FRAMES + self.phases
+        """[4, 4] camera to world. At most about 0.35 m/s and 25 degrees/s when calm, 0.8 m/s and 160 degrees/s when fast."""
+        around = 2 * np.pi * frame / MOTIONS[self.motion] + self.phases
         seconds = frame / base.NOMINAL_RATE_HZ
         tremor = np.sin(2 * np.pi * self.tremor_hz * seconds + self.tremor_phases).mean(axis=1)
         eye = np.array([0.1 + 0.45 * np.cos(around[0]), -0.4 + 0.3 * np.sin(around[0]), 1.4 + 0.08 * np.sin(around[1])])
-        yaw = 0.6 * np.sin(around[2]) + 0.006 * tremor[3]
+        turn = 0.6 * np.sin(around[2]) if self.motion == 'calm' else around[2] + 0.35 * np.sin(2 * around[2])
+        yaw = turn + 0.006 * tremor[3]
         pitch = -0.24 + 0.12 * np.sin(around[3]) + 0.006 * tremor[4]
         forward = np.array([np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), np.sin(pitch)])
         eye = eye + 0.006 * tremor[:3]
@@ -151,9 +167,10 @@ def _open(source: str, options: base.ReadOptions) -> SyntheticSequence:
     asked = LOOP_FRAMES if options.last_asked is None else options.last_asked + 1
     return SyntheticSequence(
         seed=_integer('seed', given.get('seed', '0'), 0),
-        noise=_switch('noise', given.get('noise', 'on')),
+        noise=_choice('noise', given.get('noise', 'on'), ('on', 'off')) == 'on',
         frames=_integer('frames', given.get('frames', str(asked)), 1),
         width=options.width,
+        motion=_choice('motion', given.get('motion', 'calm'), tuple(MOTIONS)),
     )
 
 
@@ -161,8 +178,8 @@ def _parse(source: str) -> dict[str, str]:
     options: dict[str, str] = {}
     for part in filter(None, source.removeprefix(SCHEME).removeprefix(':').split(',')):
         key, _, value = part.partition('=')
-        if key not in ('seed', 'noise', 'frames'):
-            raise DatasetError(f"{source}: unknown option '{key}'; use seed=N, noise=on|off, frames=N")
+        if key not in ('seed', 'noise', 'frames', 'motion'):
+            raise DatasetError(f"{source}: unknown option '{key}'; use {OPTIONS}")
         options[key] = value
     return options
 
@@ -173,12 +190,12 @@ def _integer(key: str, text: str, minimum: int) -> int:
     return int(text)
 
 
-def _switch(key: str, text: str) -> bool:
-    if text not in ('on', 'off'):
-        raise DatasetError(f"{SCHEME}: {key}='{text}' must be on or off")
-    return text == 'on'
+def _choice(key: str, text: str, allowed: tuple[str, ...]) -> str:
+    if text not in allowed:
+        raise DatasetError(f"{SCHEME}: {key}='{text}' must be {' or '.join(allowed)}")
+    return text
 
 
 FORMAT = base.Format(
-    SCHEME, f"'{SCHEME}' or '{SCHEME}:seed=N,noise=on|off,frames=N'", _recognises, _open, is_path=False
+    SCHEME, f"'{SCHEME}' or '{SCHEME}:' with {OPTIONS}", _recognises, _open, is_path=False
 )

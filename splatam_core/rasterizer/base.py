@@ -5,6 +5,13 @@ A Gaussian at camera coordinates (x, y, z) with radius r and opacity o lands on 
 covers the pixel at distance d with ``alpha = min(0.99, o exp(-d^2 / 2 s^2))``, nothing below 1/255.
 Gaussians are blended front to back by z; a pixel takes no more once its transmittance is below 1e-4.
 Centres at z <= 0.2 m are not drawn. The background is black. Where alpha is clamped it has no gradient.
+
+Anisotropic Gaussians, those with rotations, are ellipsoids of three radii s turned by R(q) in the world. They cover the image
+with covariance ``S = J W R diag(s^2) R^T W^T J^T + 0.3 I`` px^2, W the rotation into the camera and J the slope of the
+projection at the centre (its x/z and y/z held within the image and 15 % of its size around), and a pixel at offset d with
+``alpha = min(0.99, o exp(-d^T S^-1 d / 2))``. All else is as above. With three equal radii this is not quite the isotropic
+footprint: J stretches it by ``1 + tan^2`` of the angle off the axis along that direction (variance), and uses fx and fy each
+for itself.
 """
 
 from __future__ import annotations
@@ -16,6 +23,7 @@ import torch
 from torch import Tensor
 
 from splatam_core.camera import PinholeCamera
+from splatam_core.errors import RasterizerError
 from splatam_core.types import RenderedView
 
 NEAR_M = 0.2
@@ -33,11 +41,12 @@ class Gaussians:
 
     Attributes:
         means: [N, 3] metres, world.
-        log_scales: [N, 1] log metres: isotropic.
+        log_scales: [N, 1] log metres: isotropic; [N, 3] along the axes of ``rotations``: anisotropic.
         logit_opacities: [N].
         rgb: [N, 3], not clamped.
         bounds: [ceil(N / BLOCK), 7] of each run of BLOCK Gaussians the smallest mean, the largest mean and the largest log
             scale, so that a rasterizer may skip what is out of view; None where nobody has looked.
+        rotations: [N, 4] quaternions (w, x, y, z) of any length but zero, axes to world; None of isotropic Gaussians.
     """
 
     means: Tensor
@@ -45,6 +54,7 @@ class Gaussians:
     logit_opacities: Tensor
     rgb: Tensor
     bounds: Tensor | None = None
+    rotations: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.means)
@@ -52,14 +62,40 @@ class Gaussians:
     def detached(self) -> Gaussians:
         """The same values, cut off from autograd."""
         return Gaussians(
-            self.means.detach(), self.log_scales.detach(), self.logit_opacities.detach(), self.rgb.detach(), self.bounds
+            self.means.detach(), self.log_scales.detach(), self.logit_opacities.detach(), self.rgb.detach(), self.bounds,
+            None if self.rotations is None else self.rotations.detach(),
+        )  # fmt: skip
+
+    def anisotropic(self) -> Gaussians:
+        """The same as anisotropic Gaussians: three equal radii, not turned, where they are isotropic."""
+        if self.rotations is not None:
+            return self
+        upright = self.means.new_zeros(len(self), 4)
+        upright[:, 0] = 1.0
+        return Gaussians(self.means, self.log_scales.repeat(1, 3), self.logit_opacities, self.rgb, self.bounds, upright)
+
+
+def check_isotropic(gaussians: Gaussians) -> None:
+    """Refuse anisotropic Gaussians.
+
+    Raises:
+        RasterizerError: they are.
+    """
+    if gaussians.rotations is not None:
+        raise RasterizerError(
+            'the Gaussians are anisotropic, and fused fitting and isotropic maps take none: set mapping.anisotropic=true '
+            'and mapping.optimizer=autograd'
         )
 
 
 def joined(first: Gaussians, second: Gaussians) -> Gaussians:
-    """Both, the first's before the second's; without bounds."""
-    names = 'means', 'log_scales', 'logit_opacities', 'rgb'
-    return Gaussians(*(torch.cat([getattr(first, name), getattr(second, name)]) for name in names))
+    """Both, the first's before the second's; without bounds. Anisotropic where one of them is."""
+    if first.rotations is not None or second.rotations is not None:
+        first, second = first.anisotropic(), second.anisotropic()
+    names = 'means', 'log_scales', 'logit_opacities', 'rgb', 'rotations'
+    return Gaussians(
+        **{name: torch.cat([getattr(first, name), getattr(second, name)]) for name in names if getattr(first, name) is not None}
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,6 +119,7 @@ class Rates:
     log_scales: float
     logit_opacities: float
     rgb: float
+    rotations: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

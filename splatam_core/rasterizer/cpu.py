@@ -12,7 +12,8 @@ from torch import Tensor
 
 from splatam_core.camera import PinholeCamera
 from splatam_core.errors import RasterizerError
-from splatam_core.rasterizer.base import Gaussians, Moments, Rates, Render, Target
+from splatam_core.rasterizer.base import Gaussians, Moments, Rates, Render, Target, check_isotropic
+from splatam_core.rasterizer.ewa import Ellipses, project
 
 try:
     from splatam_core import _native
@@ -30,7 +31,9 @@ class CpuRasterizer:
     """
 
     def __init__(self, threads: int = 0) -> None:
-        self._engine = _native.Engine(threads or len(os.sched_getaffinity(0)))
+        threads = threads or len(os.sched_getaffinity(0))
+        self._engine = _native.Engine(threads)
+        self._blender = _native.Blender(threads)  # of anisotropic Gaussians
 
     @property
     def instruction_set(self) -> str:
@@ -40,6 +43,8 @@ class CpuRasterizer:
     def render(self, gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -> Render:
         """See ``Rasterizer.render``. float32 only."""
         _check(gaussians, T_cam_world)
+        if gaussians.rotations is not None:
+            return self._render_ellipses(project(gaussians, camera, T_cam_world), camera)
         return Render(
             *_Splat.apply(
                 gaussians.means.contiguous(), gaussians.log_scales.contiguous(),
@@ -48,8 +53,14 @@ class CpuRasterizer:
             )
         )  # fmt: skip
 
+    def _render_ellipses(self, ellipses: Ellipses, camera: PinholeCamera) -> Render:
+        shapes = torch.cat([ellipses.centers, ellipses.conics, ellipses.opacities[:, None]], dim=1)
+        image = _Blend.apply(shapes.contiguous(), ellipses.features.contiguous(), self._blender, camera)
+        return Render(image[:3], image[3], image[4])
+
     def fit(self, gaussians: Gaussians, moments: Moments, rates: Rates, target: Target) -> float:
         """See ``Rasterizer.fit``. One native call: nothing of it passes through autograd."""
+        check_isotropic(gaussians)
         _check(gaussians, target.T_cam_world)
         camera, readings = target.camera, max(1, int(torch.count_nonzero(target.depth)))
         return self._engine.fit(
@@ -68,6 +79,8 @@ def _array(tensor: Tensor | None) -> NDArray[np.float32] | None:
 def _check(gaussians: Gaussians, T_cam_world: Tensor) -> None:
     n = len(gaussians)
     expected = {'means': (n, 3), 'log_scales': (n, 1), 'logit_opacities': (n,), 'rgb': (n, 3)}
+    if gaussians.rotations is not None:
+        expected |= {'log_scales': (n, 3), 'rotations': (n, 4)}
     tensors = {name: getattr(gaussians, name) for name in expected} | {'T_cam_world': T_cam_world}
     for name, shape in (expected | {'T_cam_world': (4, 4)}).items():
         tensor = tensors[name]
@@ -118,3 +131,25 @@ class _Splat(torch.autograd.Function):
             *(None if gradient is None else gradient.numpy() for gradient in gradients), pose.numpy(),
         )  # fmt: skip
         return *gradients, pose if ctx.needs_input_grad[4] else None, None, None, None
+
+
+class _Blend(torch.autograd.Function):
+    """Sorted ellipses blended into [5, H, W]: colour, depth_acc, silhouette."""
+
+    @staticmethod
+    def forward(ctx: Any, shapes: Tensor, features: Tensor, blender: _native.Blender, camera: PinholeCamera) -> Tensor:
+        image = torch.empty(5, camera.height, camera.width)
+        ctx.lists = blender.forward(shapes.detach().numpy(), features.detach().numpy(), image.numpy())
+        ctx.blender = blender
+        ctx.save_for_backward(shapes, features, image)
+        return image
+
+    @staticmethod
+    def backward(ctx: Any, slopes: Tensor) -> tuple[Tensor | None, ...]:
+        shapes, features, image = (tensor.detach() for tensor in ctx.saved_tensors)
+        by_shapes, by_features = torch.empty_like(shapes), torch.empty_like(features)
+        ctx.blender.backward(
+            ctx.lists, shapes.numpy(), features.numpy(), image.numpy(), slopes.contiguous().numpy(),
+            by_shapes.numpy(), by_features.numpy(),
+        )  # fmt: skip
+        return by_shapes, by_features, None, None

@@ -20,7 +20,9 @@ from splatam_core.rasterizer.base import (
     Rates,
     Render,
     Target,
+    check_isotropic,
 )
+from splatam_core.rasterizer.ewa import Ellipses, project
 
 _MAX_CELLS = 20_000_000  # Gaussian-pixel pairs held at once
 
@@ -30,20 +32,14 @@ class ReferenceRasterizer:
 
     def render(self, gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -> Render:
         """See ``Rasterizer.render``."""
-        points = gaussians.means @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]  # [N, 3]
-        drawn = torch.nonzero(points[:, 2].detach() > NEAR_M)[:, 0]
-        drawn = drawn[torch.sort(points[drawn, 2].detach(), stable=True).indices]  # [K] front to back
-        x, y, z = points[drawn].unbind(-1)
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        focal = (camera.fx + camera.fy) / 2
-        variance = (focal * gaussians.log_scales[drawn, 0].exp() / z) ** 2 + BLUR_PX2
-        opacity = torch.sigmoid(gaussians.logit_opacities[drawn])
-        features = torch.cat([gaussians.rgb[drawn], z[:, None], torch.ones_like(z)[:, None]], dim=1)  # [K, 5]
-
+        on_image = _circles if gaussians.rotations is None else project
+        ellipses = on_image(gaussians, camera, T_cam_world)
+        z = ellipses.features[:, 3:]
+        features = torch.cat([ellipses.features, torch.ones_like(z)], dim=1)  # [K, 5]
         columns = torch.arange(camera.width, dtype=z.dtype)
         rows_at_once = max(1, _MAX_CELLS // max(1, len(z) * camera.width))
         bands = [
-            _blend(u, v, variance, opacity, features, columns, rows.to(z.dtype))
+            _blend(ellipses, features, columns, rows.to(z.dtype))
             for rows in torch.arange(camera.height).split(rows_at_once)
         ]
         image = torch.cat(bands, dim=1)  # [5, H, W]
@@ -51,6 +47,7 @@ class ReferenceRasterizer:
 
     def fit(self, gaussians: Gaussians, moments: Moments, rates: Rates, target: Target) -> float:
         """See ``Rasterizer.fit``."""
+        check_isotropic(gaussians)
         values = [gaussians.means, gaussians.log_scales, gaussians.logit_opacities[:, None], gaussians.rgb]
         packed = torch.cat(values, dim=1).detach().requires_grad_()  # [N, 8]
         means, log_scales, logits, rgb = packed.split([3, 1, 1, 3], dim=1)
@@ -77,12 +74,27 @@ def _l1(render: Render, target: Target) -> Tensor:
     return target.color_weight * color + target.depth_weight * depth
 
 
-def _blend(
-    u: Tensor, v: Tensor, variance: Tensor, opacity: Tensor, features: Tensor, columns: Tensor, rows: Tensor
-) -> Tensor:
-    """[5, R, W]: the features of K sorted Gaussians blended over a band of R rows."""
-    squared = (columns - u[:, None, None]) ** 2 + (rows[:, None] - v[:, None, None]) ** 2  # [K, R, W]
-    alpha = opacity[:, None, None] * torch.exp(-squared / (2 * variance[:, None, None]))
+def _circles(gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -> Ellipses:
+    """Isotropic Gaussians on the image, front to back."""
+    points = gaussians.means @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]  # [N, 3]
+    drawn = torch.nonzero(points[:, 2].detach() > NEAR_M)[:, 0]
+    drawn = drawn[torch.sort(points[drawn, 2].detach(), stable=True).indices]  # [K]
+    x, y, z = points[drawn].unbind(-1)
+    centers = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=1)
+    focal = (camera.fx + camera.fy) / 2
+    variance = (focal * gaussians.log_scales[drawn, 0].exp() / z) ** 2 + BLUR_PX2
+    conics = torch.stack([1 / variance, torch.zeros_like(z), 1 / variance], dim=1)
+    features = torch.cat([gaussians.rgb[drawn], z[:, None]], dim=1)
+    return Ellipses(centers, conics, torch.sigmoid(gaussians.logit_opacities[drawn]), features)
+
+
+def _blend(ellipses: Ellipses, features: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
+    """[5, R, W]: the features [K, 5] of sorted ellipses blended over a band of R rows."""
+    dx = columns - ellipses.centers[:, 0, None, None]  # [K, 1, W]
+    dy = rows[:, None] - ellipses.centers[:, 1, None, None]  # [K, R, 1]
+    xx, xy, yy = (entry[:, None, None] for entry in ellipses.conics.unbind(1))
+    distance = xx * dx**2 + 2 * xy * dx * dy + yy * dy**2  # [K, R, W]
+    alpha = ellipses.opacities[:, None, None] * torch.exp(-distance / 2)
     alpha = torch.where(alpha < MIN_ALPHA, torch.zeros_like(alpha), alpha.clamp(max=MAX_ALPHA))
     remaining = torch.cumprod(1 - alpha, dim=0)
     before = torch.cat([torch.ones_like(remaining[:1]), remaining[:-1]])  # transmittance in front of each

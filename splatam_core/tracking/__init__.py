@@ -11,7 +11,10 @@ from splatam_core.tracking.render_and_compare import RenderAndCompareTracker
 
 __all__ = ['AlignmentTracker', 'NullTracker', 'RenderAndCompareTracker', 'Tracker', 'TrackingResult', 'make_tracker']
 
-_TRACKERS = {'render_and_compare': RenderAndCompareTracker, 'align': AlignmentTracker, 'none': NullTracker}
+_TRACKERS = {
+    'render_and_compare': RenderAndCompareTracker, 'align': AlignmentTracker,
+    'none': NullTracker, 'truth': NullTracker,  # which Slam hands the true pose as its first guess
+}  # fmt: skip
 
 
 def make_tracker(rasterizer: Rasterizer, config: TrackingConfig, threads: int = 0) -> Tracker:

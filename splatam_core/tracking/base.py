@@ -78,7 +78,7 @@ class Candidate:
     ) -> Candidate:  # fmt: skip
         """Weigh a pose against the first guess, or the first guess itself where there is none yet."""
         if loss is None:
-            loss = tracking_loss(render, view, config.silhouette_threshold, config.color_weight, config.depth_weight)
+            loss = tracking_loss(render, view, config)
         total, readings = loss.total.item(), int(view.valid.sum())
         mean_error = guess.mean_error if guess else total / max(1, loss.num_pixels)
         return cls(T_cam_world, render, total + mean_error * (readings - loss.num_pixels), mean_error)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -9,7 +11,7 @@ from torch import Tensor
 
 from splatam_core import se3
 from splatam_core.config import TrackingConfig
-from splatam_core.losses import tracking_loss
+from splatam_core.losses import TrackingLoss, tracking_loss
 from splatam_core.rasterizer import Gaussians, Rasterizer
 from splatam_core.tracking.base import Candidate, Matrix, TrackingResult, judge
 from splatam_core.view import View
@@ -36,20 +38,29 @@ class RenderAndCompareTracker:
             ]
         )
         guess: Candidate | None = None
-        for step in range(config.iterations + 1):
+        steps = config.iterations
+        for step in itertools.count():
             pose = _pose(rotation, translation)
             render = self._rasterizer.render(gaussians, view.camera, pose)
-            loss = tracking_loss(render, view, config.silhouette_threshold, config.color_weight, config.depth_weight)
+            loss = tracking_loss(render, view, config)
             candidate = Candidate.of(_float64(pose.detach()), render, view, config, guess, loss)
             if guess is None:
                 guess = best = candidate
             elif candidate.cost < best.cost:
                 best = candidate
-            if step < config.iterations:
-                optimizer.zero_grad()
-                loss.total.backward()
-                optimizer.step()
+            if step == config.iterations and self._is_poor(loss, view):
+                steps = 2 * config.iterations
+            if step == steps:
+                break
+            optimizer.zero_grad()
+            loss.total.backward()
+            optimizer.step()
         return judge(best.T_cam_world, best.render, view, config)
+
+    def _is_poor(self, loss: TrackingLoss, view: View) -> bool:
+        """Whether depth is so far off that more steps are worth it; the original compares the sum over the image."""
+        limit_m = self._config.extend_above_m
+        return limit_m > 0 and loss.depth.item() > limit_m * view.depth.numel()
 
 
 def _pose(quaternion: Tensor, translation: Tensor) -> Tensor:

@@ -52,6 +52,22 @@ def random_scene(seed: int, count: int, width: int, height: int, sigma_px: float
     return Scene(Gaussians(means, scales[:, None], logit + 1.5 * spread[:, 1], rgb), cam, pose(seed))
 
 
+def anisotropic_scene(seed: int, count: int, width: int, height: int, **options: float) -> Scene:
+    """The same places as ``random_scene``; radii that differ threefold and more, turned anyhow."""
+    scene = random_scene(seed, count, width, height, **options)
+    generator = torch.Generator().manual_seed(seed + 1000)
+    g = scene.gaussians
+    scales = g.log_scales + 0.7 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    quaternions = torch.randn(count, 4, generator=generator, dtype=torch.float64)
+    turned = Gaussians(g.means, scales, g.logit_opacities, g.rgb, rotations=quaternions)
+    return Scene(turned, scene.camera, scene.T_cam_world)
+
+
+def parameters(gaussians: Gaussians) -> tuple[str, ...]:
+    """The names of the tensors."""
+    return PARAMETERS if gaussians.rotations is None else (*PARAMETERS, 'rotations')
+
+
 def one(mean: tuple[float, float, float], sigma_m: float, opacity: float, cam: PinholeCamera) -> Scene:
     """A single white Gaussian seen from the origin."""
     gaussians = Gaussians(
@@ -85,7 +101,7 @@ def render_with_gradients(
     rasterizer: Rasterizer, scene: Scene, dtype: torch.dtype, weights: Tensor
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The images, and the gradient of their weighted sum by every input (``T_cam_world``: upper three rows)."""
-    leaves = {name: getattr(scene.gaussians, name).to(dtype).clone().requires_grad_() for name in PARAMETERS}
+    leaves = {name: getattr(scene.gaussians, name).to(dtype).clone().requires_grad_() for name in parameters(scene.gaussians)}
     T = scene.T_cam_world.to(dtype).clone().requires_grad_()
     image = images(rasterizer.render(Gaussians(**leaves), scene.camera, T))
     (image * weights.to(dtype)).sum().backward()

@@ -42,6 +42,13 @@ def test_presets_are_the_originals_configurations(preset, tracking, mapping, win
     assert (config.mapping.every, config.keyframes.every, t.silhouette_threshold) == (1, 5, 0.99)
 
 
+def test_presets_for_far_apart_photographs_track_longer_where_depth_stays_off() -> None:
+    """The original's 20000 metres times pixels, at the image sizes it was meant for."""
+    assert load_config('scannetpp').tracking.extend_above_m == pytest.approx(20000 / (584 * 876), rel=0.01)
+    assert load_config('iphone').tracking.extend_above_m == pytest.approx(20000 / (720 * 960), rel=0.01)
+    assert all(load_config(name).tracking.extend_above_m == 0 for name in ('splatam', 'splatam_s', 'tum', 'scannet'))
+
+
 def test_overrides_win_over_the_preset() -> None:
     config = load_config('splatam_s', ['tracking.iterations=7', 'mapping.means_rate=1e-3', 'seed=3'])
     assert (config.tracking.iterations, config.mapping.means_rate, config.seed) == (7, 1e-3, 3)
@@ -74,6 +81,13 @@ def test_wrong_overrides_say_what_is_right(override: str, message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         load_config('quick', [override])
     assert message in str(caught.value)
+
+
+def test_settings_that_exclude_each_other_are_refused() -> None:
+    with pytest.raises(ConfigError, match='anisotropic.*mapping.optimizer=autograd'):
+        load_config('realtime', ['mapping.anisotropic=true'])
+    with pytest.raises(ConfigError, match='depth_outlier_ratio.*mapping.optimizer=autograd'):
+        load_config('realtime', ['mapping.depth_outlier_ratio=10'])
 
 
 def test_unknown_preset_lists_the_known() -> None:

@@ -10,9 +10,10 @@ import pytest
 
 from splatam_core import se3
 from splatam_core.camera import PinholeCamera
+from splatam_core.config import load_config
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.datasets.room import ROOM_SIZE_M, look_at
-from splatam_core.datasets.synthetic import CAMERA, SyntheticSequence, measured
+from splatam_core.datasets.synthetic import CAMERA, MOTIONS, SyntheticSequence, measured
 from splatam_core.errors import DatasetError
 
 WIDTH = 160
@@ -113,6 +114,25 @@ def test_walk_is_smooth_stays_inside_and_comes_back():
     assert np.degrees(np.ptp(yaws)) > 60  # it looks around
 
 
+def test_fast_walk_needs_prediction_and_shows_new_ground():
+    """Out of reach of the paper's tracking steps from the last pose, well within it from a constant velocity."""
+    config = load_config('splatam').tracking
+    reach = 2 * config.iterations * config.rotation_rate  # radians: Adam moves each half-angle by its rate a step
+    walks = [SyntheticSequence(frames=240, width=32, motion=motion, seed=seed) for motion in MOTIONS for seed in (0, 1, 2)]
+    for sequence in walks:
+        truth = sequence.ground_truth().T_world_cam
+        steps = np.array([se3.log(se3.inverse(a) @ b) for a, b in pairwise(truth)])
+        turned, surprise = np.linalg.norm(steps[:, 3:], axis=1), np.linalg.norm(np.diff(steps[:, 3:], axis=0), axis=1)
+        assert ((turned > reach).mean() > 0.6) == (sequence._walk.motion == 'fast')
+        assert turned[0] < reach  # the first step is nobody's to predict
+        assert surprise.max() < 0.3 * reach
+        assert np.linalg.norm(np.diff(steps[:, :3], axis=0), axis=1).max() < 0.3 * config.iterations * config.translation_rate
+        assert np.all(np.abs(truth[:, :3, 3]) < np.array([0.8, 0.8, 1.6]))
+    back = se3.log(se3.inverse(truth[0]) @ truth[120])
+    assert np.linalg.norm(back[:3]) < 0.03
+    assert truth[:, :3, 2].max() > 0.9 and truth[:, :2, 2].min() < -0.9  # it looks everywhere
+
+
 @pytest.mark.parametrize('width', [320, 100])
 def test_width_renders_the_resized_camera(room, width):
     sequence = room(frames=1, width=width)
@@ -177,7 +197,8 @@ def test_picture_has_detail_to_hold(room):
 @pytest.mark.parametrize(
     ('source', 'message'),
     [
-        ('synthetic:sed=3', "unknown option 'sed'; use seed=N, noise=on|off, frames=N"),
+        ('synthetic:sed=3', "unknown option 'sed'; use seed=N, noise=on|off, frames=N, motion=calm|fast"),
+        ('synthetic:motion=slow', "motion='slow' must be calm or fast"),
         ('synthetic:seed=-1', "seed='-1' must be a whole number, at least 0"),
         ('synthetic:seed=x', "seed='x'"),
         ('synthetic:frames=0', "frames='0' must be a whole number, at least 1"),

@@ -7,11 +7,13 @@ import pytest
 import torch
 
 from splatam_core.camera import PinholeCamera
+from splatam_core.config import MappingConfig, TrackingConfig
 from splatam_core.losses import mapping_loss, ssim_map, tracking_loss
 from splatam_core.rasterizer import Render
 from splatam_core.view import View
 
 CAMERA = PinholeCamera(6, 4, 5.0, 5.0, 3.0, 2.0)
+L1 = MappingConfig(ssim_weight=0.0)
 GRAY = torch.full((4, 6, 3), 102, dtype=torch.uint8)  # 0.4
 
 
@@ -28,21 +30,45 @@ def _render(rgb: float, depth: float, silhouette: torch.Tensor) -> Render:
 def test_tracking_loss_sums_where_the_map_is_sure_and_depth_is_read() -> None:
     silhouette = torch.zeros(4, 6)
     silhouette[:, :3] = 1.0
-    loss = tracking_loss(_render(0.5, 2.3, silhouette), _view(), 0.99, 0.5, 1.0)
+    loss = tracking_loss(_render(0.5, 2.3, silhouette), _view(), TrackingConfig())
     pixels = 3 * 3  # three columns sure, three rows with depth
     assert loss.num_pixels == pixels
     assert float(loss.total) == pytest.approx(pixels * (1.0 * 0.3 + 0.5 * 3 * 0.1), rel=1e-5)
 
 
+def test_tracking_loss_without_the_silhouette_takes_colour_from_everywhere() -> None:
+    render = _render(0.5, 2.3, torch.ones(4, 6))
+    render.silhouette[:, :3] = 0.6  # not sure
+    loss = tracking_loss(render, _view(), TrackingConfig(use_silhouette=False))
+    assert loss.num_pixels == 3 * 6  # three rows with depth
+    depth = 3 * 3 * (0.3 + 2.3 / 0.6 - 2.0)
+    assert float(loss.depth) == pytest.approx(depth, rel=1e-5)
+    assert float(loss.total) == pytest.approx(depth + 0.5 * 4 * 6 * 3 * 0.1, rel=1e-5)
+
+
+def test_losses_leave_out_outliers_of_depth() -> None:
+    """One pixel 100 times as far off as the median, which is that of the readings alone."""
+    render, view = _render(0.5, 2.1, torch.ones(4, 6)), _view()
+    render.depth_acc[3, 5] = 12.0
+    render.rgb[:, 3, 5] = 0.4
+    tracked = [tracking_loss(render, view, TrackingConfig(depth_outlier_ratio=ratio)) for ratio in (0.0, 10.0)]
+    assert [loss.num_pixels for loss in tracked] == [18, 17]
+    assert [float(loss.depth) for loss in tracked] == pytest.approx([17 * 0.1 + 10.0, 17 * 0.1], rel=1e-5)
+    mapped = [mapping_loss(render, view, MappingConfig(ssim_weight=0.0, color_weight=0.0, depth_outlier_ratio=r)) for r in (0.0, 10.0)]
+    assert [float(loss) for loss in mapped] == pytest.approx([(17 * 0.1 + 10.0) / 18, 0.1], rel=1e-5)
+    blind = View(CAMERA, GRAY, torch.zeros(4, 6))
+    assert float(tracking_loss(render, blind, TrackingConfig(depth_outlier_ratio=10.0)).total) == 0.0
+
+
 def test_mapping_loss_means_depth_over_readings_and_colour_over_all() -> None:
-    loss = mapping_loss(_render(0.5, 2.3, torch.zeros(4, 6)), _view(), 0.0, 0.5, 1.0)
+    loss = mapping_loss(_render(0.5, 2.3, torch.zeros(4, 6)), _view(), L1)
     assert float(loss) == pytest.approx(0.3 + 0.5 * 0.1, rel=1e-5)
 
 
 def test_mapping_loss_of_a_view_without_depth_is_the_colour_loss() -> None:
     depth = torch.zeros(4, 6)
     view = View(CAMERA, GRAY, depth)
-    loss = mapping_loss(_render(0.5, 2.3, torch.zeros(4, 6)), view, 0.0, 0.5, 1.0)
+    loss = mapping_loss(_render(0.5, 2.3, torch.zeros(4, 6)), view, L1)
     assert float(loss) == pytest.approx(0.05, rel=1e-5)
 
 

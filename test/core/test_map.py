@@ -13,7 +13,7 @@ from splatam_core.camera import PinholeCamera
 from splatam_core.config import DensificationConfig, KeyframeConfig, MappingConfig, load_config
 from splatam_core.densification import densify, new_gaussians, unexplained
 from splatam_core.gaussian_map import PARAMETERS, GaussianMap
-from splatam_core.keyframes import PosedView, draw, overlaps, select_window
+from splatam_core.keyframes import PosedView, draw, is_due, overlaps, select_window
 from splatam_core.mapping import prunable, refine
 from splatam_core.rasterizer import Gaussians, Rates, Render, make_rasterizer
 from splatam_core.view import View
@@ -256,6 +256,45 @@ def test_window_holds_overlapping_keyframes_the_last_and_the_current() -> None:
         assert all(any(w is k for k in near) for w in window[:-2])
         assert len({id(w) for w in window}) == 5
     assert len({frozenset(map(id, window)) for window in windows}) > 1  # random, not always the same
+
+
+@pytest.mark.parametrize(
+    ('selection', 'expected'),
+    [('most_overlap', {0, 1, 2}), ('latest', {7, 8, 9}), ('uniform', {0, 4, 9}), ('random', None)],
+)
+def test_other_selections_of_keyframes(selection: str, expected: set[int] | None) -> None:
+    """Ten keyframes that overlap the less the later they are, then the last and the current view."""
+    view = _view()
+    keyframes = [PosedView(view, _at(0.0, 0.07 * k)) for k in range(10)]
+    last, current = PosedView(view, _at(9.0)), PosedView(view, EYE)
+    config = KeyframeConfig(window=5, overlap_margin=0, overlap_samples=4000, selection=selection)
+    rng = np.random.default_rng(0)
+    windows = [select_window(current, [*keyframes, last], config, rng) for _ in range(20)]
+    chosen = [{next(i for i, k in enumerate(keyframes) if k is w) for w in window[:-2]} for window in windows]
+    assert all(window[-2] is last and window[-1] is current for window in windows)
+    assert all(len(some) == 3 for some in chosen)
+    if expected is None:
+        assert set.union(*chosen) == set(range(10))
+    else:
+        assert all(some == expected for some in chosen)
+    few = select_window(current, [*keyframes[:2], last], config, rng)
+    assert {id(w) for w in few} == {id(w) for w in (*keyframes[:2], last, current)}
+
+
+@pytest.mark.parametrize(
+    ('config', 'num_frames', 'kept'),
+    [
+        (KeyframeConfig(), 12, [0, 5, 10]),
+        (KeyframeConfig(at_least=5), 10, [0, 2, 4, 6, 8]),  # the original's n // 5 for recordings below 25 frames
+        (KeyframeConfig(at_least=5), 3, [0, 1, 2]),
+        (KeyframeConfig(at_least=5), 30, [0, 5, 10, 15, 20, 25]),
+        (KeyframeConfig(at_least=5), None, [0, 5, 10]),  # live
+        (KeyframeConfig(before_last=True), 10, [0, 5, 8]),
+        (KeyframeConfig(before_last=True), None, [0, 5, 10]),
+    ],
+)
+def test_which_frames_are_kept(config: KeyframeConfig, num_frames: int | None, kept: list[int]) -> None:
+    assert [i for i in range(num_frames or 12) if is_due(i, config, num_frames)] == kept
 
 
 def test_window_of_one_and_of_the_first_frame() -> None:

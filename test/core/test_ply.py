@@ -79,12 +79,25 @@ def test_reads_maps_of_other_programs(tmp_path: Path) -> None:
     assert gaussians.log_scales.tolist() == [[-5.0]] * 3
 
 
-def test_anisotropic_maps_are_refused(tmp_path: Path) -> None:
+def test_anisotropic_maps_keep_scales_and_rotations(tmp_path: Path) -> None:
+    g = some_gaussians(20)
+    written = Gaussians(g.means, torch.randn(20, 3) - 4, g.logit_opacities, g.rgb, rotations=torch.randn(20, 4))
+    write_ply(tmp_path / 'map.ply', written)
+    back = read_ply(tmp_path / 'map.ply')
+    assert torch.equal(back.log_scales, written.log_scales) and torch.equal(back.rotations, written.rotations)
+    assert torch.equal(back.means, written.means)
+
+
+def test_anisotropic_maps_need_rotations(tmp_path: Path) -> None:
     dtype = [(name, '<f4') for name in STANDARD]
     rows = np.zeros(2, dtype=dtype)
     rows['scale_1'] = [0, 1]
+    rows['rot_0'] = [1, 0]
     other_map(tmp_path / 'other.ply', dtype, rows)
-    with pytest.raises(MapFileError, match='only isotropic'):
+    with pytest.raises(MapFileError, match='1 of 2 Gaussians have a quaternion of length zero'):
+        read_ply(tmp_path / 'other.ply')
+    other_map(tmp_path / 'other.ply', dtype[:-1], rows[[name for name, _ in dtype[:-1]]].astype(dtype[:-1]))
+    with pytest.raises(MapFileError, match='rotations are needed; no property rot_3'):
         read_ply(tmp_path / 'other.ply')
 
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import rasterizer_scenes as scenes
 import torch
 from rasterizer_scenes import Scene
 
+from splatam_core import se3
+from splatam_core.camera import PinholeCamera
 from splatam_core.errors import RasterizerError
 from splatam_core.rasterizer import Gaussians, Moments, Rasterizer, Rates, Target, make_rasterizer
 from splatam_core.rasterizer.base import MAX_ALPHA, MIN_ALPHA
@@ -48,6 +51,10 @@ SCENES = {
     'opaque': scenes.random_scene(8, 300, 50, 37, logit=6.0),
     'faint': scenes.random_scene(9, 300, 50, 37, logit=-5.0),
     'at the left border': scenes.one((-0.59 * 2, 0.0, 2.0), 0.05, 0.7, scenes.camera(40, 30)),
+    'anisotropic': scenes.anisotropic_scene(31, 300, 61, 45),
+    'anisotropic, many': scenes.anisotropic_scene(32, 3000, 33, 25),
+    'anisotropic, opaque': scenes.anisotropic_scene(33, 200, 50, 37, logit=6.0),
+    'anisotropic, none': scenes.anisotropic_scene(34, 0, 21, 13),
     'at the near plane': scenes.one((0.0, 0.0, 0.2000001), 0.01, 0.7, scenes.camera(40, 30)),
 }
 
@@ -116,9 +123,9 @@ def test_fitting_steps_equal_the_reference(name: str, backend: str, threads: int
         assert one.shape == other.shape and torch.isfinite(one).all()
 
 
-def test_reference_gradients_equal_finite_differences() -> None:
+@pytest.mark.parametrize('scene', [scenes.random_scene(11, 25, 16, 12), scenes.anisotropic_scene(11, 25, 16, 12)])
+def test_reference_gradients_equal_finite_differences(scene: Scene) -> None:
     """Central differences in float64, along random directions in all parameters and the pose at once."""
-    scene = scenes.random_scene(11, 25, 16, 12)
     weights = torch.randn(5, 12, 16, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     _, gradients = scenes.render_with_gradients(ReferenceRasterizer(), scene, torch.float64, weights)
     generator = torch.Generator().manual_seed(3)
@@ -134,7 +141,8 @@ def test_reference_gradients_equal_finite_differences() -> None:
 
 
 def _loss(scene: Scene, direction: dict[str, torch.Tensor], step: float, weights: torch.Tensor) -> float:
-    moved = {name: getattr(scene.gaussians, name) + step * direction[name] for name in scenes.PARAMETERS}
+    names = scenes.parameters(scene.gaussians)
+    moved = {name: getattr(scene.gaussians, name) + step * direction[name] for name in names}
     T = scene.T_cam_world.clone()
     T[:3] += step * direction['T_cam_world']
     return float((scenes.images(ReferenceRasterizer().render(Gaussians(**moved), scene.camera, T)) * weights).sum())
@@ -164,6 +172,46 @@ def test_one_gaussian_by_hand(backend: str, threads: int) -> None:
     reach = math.sqrt(2 * math.log(opacity / MIN_ALPHA) * variance)
     touched = torch.nonzero(image[4])
     assert int((touched - torch.tensor([15, 20])).pow(2).sum(1).max()) <= reach**2
+
+
+@pytest.mark.parametrize(('backend', 'threads'), ALL)
+def test_one_ellipse_by_hand(backend: str, threads: int) -> None:
+    """A needle on the optical axis, turned by 30 degrees about it, and the camera by another 15: 45 degrees on the image."""
+    cam, z = PinholeCamera(41, 31, 40.0, 40.0, 20.0, 15.0), 2.0
+    turn = math.radians(15.0)
+    needle = Gaussians(
+        torch.tensor([[0.0, 0.0, z]]), torch.log(torch.tensor([[0.3, 0.05, 0.01]])), torch.tensor([0.0]), torch.ones(1, 3),
+        rotations=2.0 * torch.tensor([[math.cos(turn), 0.0, 0.0, math.sin(turn)]]),  # any length will do
+    )
+    roll = torch.from_numpy(se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, turn]))).float()
+    image = scenes.images(make_rasterizer(backend, threads).render(needle, cam, roll))
+    along, across = ((cam.fx * radius / z) ** 2 + 0.3 for radius in (0.3, 0.05))
+    assert float(image[4, 15, 20]) == pytest.approx(0.5, rel=1e-5)
+    assert float(image[4, 18, 23]) == pytest.approx(0.5 * math.exp(-18 / (2 * along)), rel=1e-4)  # (3, 3): u right, v down
+    assert float(image[4, 16, 19]) == pytest.approx(0.5 * math.exp(-2 / (2 * across)), rel=1e-4)  # (-1, 1)
+    assert float(image[3, 15, 20]) == pytest.approx(z * 0.5, rel=1e-5)
+
+
+def test_equal_radii_are_the_isotropic_gaussian_up_to_the_projection_s_stretch() -> None:
+    """On the axis they agree; off it the variance grows by 1 + tan^2 along the direction outwards (base.py)."""
+    cam = PinholeCamera(81, 61, 60.0, 60.0, 40.0, 30.0)
+    rasterizer, pose = make_rasterizer('reference'), torch.eye(4, dtype=torch.float64)
+    centred = scenes.one((0.0, 0.0, 2.0), 0.1, 0.6, cam).gaussians
+    aside = scenes.one((1.0, 0.0, 2.0), 0.1, 0.6, cam).gaussians  # tan = 0.5, at pixel 70
+    one, other = (scenes.images(rasterizer.render(g, cam, pose)) for g in (centred, centred.anisotropic()))
+    torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
+    silhouette = rasterizer.render(aside.anisotropic(), cam, pose).silhouette
+    variance = (60.0 * 0.1 / 2) ** 2
+    assert float(silhouette[30, 74]) == pytest.approx(0.6 * math.exp(-16 / (2 * (1.25 * variance + 0.3))), rel=1e-9)
+    assert float(silhouette[34, 70]) == pytest.approx(0.6 * math.exp(-16 / (2 * (variance + 0.3))), rel=1e-9)
+
+
+@pytest.mark.parametrize('backend', ['cpu', 'reference'])
+def test_fused_fitting_refuses_anisotropic_gaussians(backend: str) -> None:
+    scene = SCENES['anisotropic']
+    moments = Moments(torch.zeros(300, 16), torch.zeros(300, dtype=torch.uint8))
+    with pytest.raises(RasterizerError, match='anisotropic'):
+        make_rasterizer(backend, 1).fit(scene.gaussians, moments, Rates(1e-4, 1e-3, 0.05, 2.5e-3), _target(scene))
 
 
 @pytest.mark.parametrize(('backend', 'threads'), ALL)
@@ -215,9 +263,10 @@ def test_gaussians_that_are_not_finite_spoil_nothing(value: float) -> None:
     )
 
 
-def test_threads_do_not_change_the_image_and_repeats_do_not_change_gradients() -> None:
+@pytest.mark.parametrize('name', ['many, deep', 'anisotropic, many'])
+def test_threads_do_not_change_the_image_and_repeats_do_not_change_gradients(name: str) -> None:
     """Bit for bit."""
-    scene = SCENES['many, deep']
+    scene = SCENES[name]
     weights = torch.randn(5, 25, 33, generator=torch.Generator().manual_seed(4))
     runs = [
         scenes.render_with_gradients(make_rasterizer('cpu', threads), scene, torch.float32, weights)

@@ -1,0 +1,130 @@
+"""The paper's tables, as far as the recordings at hand allow: ablations, tracking and rendering, held-out views.
+
+    python benchmarks/paper_tables.py [--data ../shared/data] [--width 320] [--max-frames N] [--out out/paper_tables]
+
+Ablations (Tables 4, 5 and S.1): on the fast walk through the synthetic room, on the start of 7scenes_redkitchen, and on
+every fifth frame of it. Tracking and rendering (Tables 1 to 3): preset `splatam` on both recordings, scored as this project
+defines its metrics and, with `splatam_` in front, as the original's code computes them. Held-out views: the same with every
+8th frame kept out of mapping (`heldout_`). One thread each, one run after the other: hours. Runs that are finished are not
+done again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from header import print_header
+
+KITCHEN, DESK = '7scenes_redkitchen', 'tum_fr1_rpy'
+HOLDOUT = 8
+HONEST = ('frames', 'tracked', 'ate_rmse_m', 'psnr_db', 'psnr_full_db', 'ssim', 'depth_l1_m', 'num_gaussians', 'fps')
+NAMED = ('splatam_', 'heldout_')
+EXIT_INTERRUPTED = 130
+
+
+@dataclass(frozen=True, slots=True)
+class Set:
+    """A set of ablations.
+
+    Attributes:
+        name: of its folder.
+        source: the recording.
+        stride: every how manieth frame of it.
+    """
+
+    name: str
+    source: str
+    stride: int = 1
+
+
+def splatam(*arguments: str, prints: bool = False) -> None:
+    """The command line in a process of its own; what fails there is said there, and is missing in the tables."""
+    command = [sys.executable, '-m', 'splatam_core.cli', *arguments]
+    code = subprocess.run(command, stdout=None if prints else sys.stderr, check=False).returncode
+    if code == EXIT_INTERRUPTED:
+        raise KeyboardInterrupt
+
+
+def ablations(chosen: Set, args: argparse.Namespace) -> None:
+    """Run a set and print its table."""
+    print_header(f'Ablations, {chosen.name}: width {args.ablation_width}, {args.ablation_frames} frames', 1)
+    size = ['--width', str(args.ablation_width), '--max-frames', str(args.ablation_frames), '--stride', str(chosen.stride)]
+    only = ['--only', *args.only] if args.only else []
+    out = args.out / f'ablations_{chosen.name}_{args.ablation_width}_{args.ablation_frames}'
+    splatam('ablations', chosen.source, *size, '--set', 'threads=1', *only, '--out', str(out), prints=True)
+    print(flush=True)
+
+
+def scored_run(recording: Path, args: argparse.Namespace, holdout: int) -> Path:
+    """The folder of a run of preset `splatam` over a recording, made unless it is there."""
+    frames = f'_{args.max_frames}' if args.max_frames else ''
+    kind = f'holdout{holdout}' if holdout else 'all'
+    folder = args.out / f'{recording.name}_{args.width}{frames}_{kind}'
+    if metrics(folder).get('psnr_db') is None:
+        cut = ['--max-frames', str(args.max_frames)] if args.max_frames else []
+        options = ['--holdout', str(holdout)] if holdout else []
+        command = ['run', str(recording), '--preset', 'splatam', '--width', str(args.width), '--set', 'threads=1']
+        splatam(*command, *cut, *options, '--out', str(folder), *(['--overwrite'] if folder.exists() else []))
+    return folder
+
+
+def metrics(folder: Path) -> dict[str, object]:
+    """What a run's folder says; nothing where there is none."""
+    path = folder / 'metrics.json'
+    return json.loads(path.read_text()) if path.is_file() else {}
+
+
+def print_metrics(folders: Sequence[Path]) -> None:
+    """Runs side by side: the honest metrics, then those with a name in front."""
+    columns = [metrics(folder) for folder in folders]
+    named = sorted({name for column in columns for name in column if name.startswith(NAMED)}, key=_by_prefix)
+    print('| metric | ' + ' | '.join(folder.name for folder in folders) + ' |')
+    print('|---' * (len(folders) + 1) + '|')
+    for name in (*HONEST, *named):
+        print(f'| `{name}` | ' + ' | '.join(_text(column.get(name)) for column in columns) + ' |')
+    print(flush=True)
+
+
+def _by_prefix(name: str) -> tuple[int, str]:
+    return next(index for index, prefix in enumerate(NAMED) if name.startswith(prefix)), name
+
+
+def _text(value: object) -> str:
+    if value is None:
+        return '–'
+    return f'{value:.4g}' if isinstance(value, float) else str(value)
+
+
+def main() -> None:
+    """Run what is not done yet, and print all tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    default = Path(os.environ.get('SPLATAM_DATA') or '../shared/data')
+    parser.add_argument('--data', type=Path, default=default, help=f'folder of {KITCHEN} and {DESK} (default: %(default)s)')
+    parser.add_argument('--width', type=int, default=320, help='of tracking and rendering (default: %(default)s)')
+    parser.add_argument('--max-frames', type=int, help='of tracking and rendering (default: all)')
+    parser.add_argument('--ablation-width', type=int, default=128, help='default: %(default)s')
+    parser.add_argument('--ablation-frames', type=int, default=40, help='default: %(default)s')
+    parser.add_argument('--only', nargs='+', metavar='NAME', help='some of the ablations')
+    parser.add_argument('--out', type=Path, default=Path('out/paper_tables'), help='default: %(default)s')
+    args = parser.parse_args()
+    recordings = [args.data / KITCHEN, args.data / DESK]
+    if missing := [str(path) for path in recordings if not path.is_dir()]:
+        parser.error(f'{", ".join(missing)} is absent: --data or SPLATAM_DATA names the folder of the recordings')
+
+    kitchen = str(recordings[0])
+    for chosen in (Set('room', 'synthetic:motion=fast'), Set('redkitchen', kitchen), Set('redkitchen_every_5th', kitchen, 5)):
+        ablations(chosen, args)
+    for title, holdout in (('Tracking and rendering', 0), (f'Held-out views: every {HOLDOUT}th frame', HOLDOUT)):
+        print_header(f'{title}, preset `splatam`, width {args.width}', 1)
+        print_metrics([scored_run(recording, args, holdout) for recording in recordings])
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,41 @@
+// Blends ellipses front to back over tiles of 8x8 pixels, and back: the image half of the anisotropic contract. Where the
+// ellipses come from is not its business.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <vector>
+
+#include "thread_pool.hpp"
+
+namespace splatam {
+
+constexpr int kShape = 6;     // of an ellipse: u, v, inverse covariance xx xy yy, opacity
+constexpr int kFeatures = 4;  // red, green, blue, z
+constexpr int kChannels = 5;  // of the image: the features and the silhouette
+
+// Which ellipses may touch which tile, front to back.
+struct TileLists {
+  int width = 0, height = 0, tiles_x = 0, tiles_y = 0;
+  std::vector<std::size_t> begins;  // tiles + 1
+  std::vector<std::uint32_t> entries;
+};
+
+class Blender {
+ public:
+  explicit Blender(int threads) : pool_(threads) {}
+
+  // shapes: [count, kShape] front to back; features: [count, kFeatures]; image: [kChannels, height, width].
+  std::shared_ptr<TileLists> forward(const float* shapes, const float* features, std::size_t count, int width, int height,
+                                     float* image);
+
+  // image: what forward drew; slopes: of a loss by it. Writes the loss's slopes by shapes and features.
+  void backward(const TileLists&, const float* shapes, const float* features, std::size_t count, const float* image,
+                const float* slopes, float* shape_slopes, float* feature_slopes);
+
+ private:
+  ThreadPool pool_;
+};
+
+}  // namespace splatam

@@ -1,0 +1,66 @@
+"""The paper's ablations: each switches off what it names, and a set goes on where it stopped."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from splatam_core.ablations import FULL, variant_names, variants
+from splatam_core.cli import main
+from splatam_core.config import flat_values
+
+SMALL = ['synthetic', '--width', '48', '--max-frames', '3', '--set', 'threads=1', '--set', 'tracking.iterations=2',
+         '--set', 'mapping.iterations=2']  # fmt: skip
+
+
+def test_each_variant_changes_what_it_is_named_after_and_nothing_else() -> None:
+    full, *others = variants(variant_names(), 'splatam')
+    assert full.name == FULL and len(others) >= 9
+    changed = {
+        variant.name: {
+            name: value for name, value in flat_values(variant.config).items() if value != flat_values(full.config)[name]
+        }
+        for variant in others
+    }
+    assert changed['color_only'] == {'tracking.depth_weight': 0.0, 'mapping.depth_weight': 0.0}
+    assert changed['depth_only'] == {'tracking.color_weight': 0.0}
+    assert changed['no_velocity'] == {'tracking.motion_model': 'last_pose'}
+    assert changed['no_silhouette'] == {'tracking.use_silhouette': False}
+    assert changed['silhouette_050'] == {'tracking.silhouette_threshold': 0.5}
+    assert {name for values in changed.values() for name in values if name.startswith('keyframes')} == {'keyframes.selection'}
+    assert all(changed.values())
+
+
+def in_this_process(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+    """In place of a process of its own, which takes seconds to import everything anew."""
+    return subprocess.CompletedProcess(command, main(command[3:]))
+
+
+def test_a_set_is_run_once_and_printed(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = ['ablations', *SMALL, '--only', 'full', 'no_velocity', '--out', str(tmp_path)]
+    assert main(['ablations', *SMALL, '--only', 'full', '--out', str(tmp_path)]) == 0
+    capfd.readouterr()
+    monkeypatch.setattr('splatam_core.ablations.subprocess', SimpleNamespace(run=in_this_process))
+    assert main(command) == 0
+    first = capfd.readouterr()
+    assert 'runs: 1' in first.out and '| full | 3/3 |' in first.out and '| no_velocity | 3/3 |' in first.out
+    written = {path: path.stat().st_mtime_ns for path in tmp_path.rglob('*') if path.is_file()}
+    (tmp_path / 'no_velocity' / 'metrics.json').unlink()  # as if it had been stopped
+    assert main(command) == 0
+    again = capfd.readouterr()
+    rows = [line.rpartition(' | ')[0] for text in (first.out, again.out) for line in text.splitlines() if line[:3] == '| n']
+    assert rows[0] == rows[1]  # the same but for the time it took
+    unchanged = {path for path, stamp in written.items() if path.stat().st_mtime_ns == stamp}
+    assert {path.parent.name for path in unchanged} == {'full'}
+    assert main([*command, '--set', 'seed=1']) == 2
+    assert 'holds a run of other settings' in capfd.readouterr().err
+
+
+def test_an_unknown_ablation_lists_the_known(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['ablations', *SMALL, '--only', 'no_luck', '--out', 'never']) == 2
+    assert "unknown ablation 'no_luck'; shipped: full, " in capsys.readouterr().err
