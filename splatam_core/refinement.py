@@ -6,6 +6,7 @@ The original's ``post_splatam_opt.py`` does the same, with the same losses as in
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict
 
 import numpy as np
 import torch
@@ -51,7 +52,7 @@ def refine_map(
     Raises:
         RunFolderError: none of the poses is that of a frame.
     """
-    gaussian_map = GaussianMap()
+    gaussian_map = GaussianMap(gaussians.rotations is not None)
     gaussian_map.append(gaussians.detached())
     views = _endless(sequence, poses, config)
     first = next(views)
@@ -61,7 +62,7 @@ def refine_map(
         posed, weights = next(views), config.mapping
         gaussian_map.set_rates(_faded(rates(weights), LAST_RATE ** (step / iterations)))
         render = rasterizer.render(gaussian_map.gaussians, posed.view.camera, posed.T_cam_world)
-        mapping_loss(render, posed.view, weights.ssim_weight, weights.color_weight, weights.depth_weight).backward()
+        mapping_loss(render, posed.view, weights).backward()
         if weights.prune_every and step % PRUNE_EVERY == 0:
             gaussian_map.keep(~prunable(gaussian_map, weights, scene_radius))
         gaussian_map.step()
@@ -70,7 +71,7 @@ def refine_map(
 
 
 def _faded(rates: Rates, factor: float) -> Rates:
-    return Rates(*(factor * rate for rate in (rates.means, rates.log_scales, rates.logit_opacities, rates.rgb)))
+    return Rates(**{name: factor * rate for name, rate in asdict(rates).items()})
 
 
 def _endless(sequence: Sequence, poses: Mapping[int, NDArray[np.float64]], config: SlamConfig) -> Iterator[PosedView]:
