@@ -1,6 +1,6 @@
 """The paper's tables, as far as the recordings at hand allow: ablations, tracking and rendering, held-out views.
 
-    python benchmarks/paper_tables.py [--data ../shared/data] [--width 320] [--max-frames N] [--out out/paper_tables]
+    python benchmarks/paper_tables.py [--data ../shared/data] [--width 320] [--max-frames N] [--no-ablations] [--out ...]
 
 Ablations (Tables 4, 5 and S.1): on the fast walk through the synthetic room, on the start of 7scenes_redkitchen, and on
 every fifth frame of it. Tracking and rendering (Tables 1 to 3): preset `splatam` on both recordings, scored as this project
@@ -112,6 +112,7 @@ def main() -> None:
     parser.add_argument('--ablation-width', type=int, default=128, help='default: %(default)s')
     parser.add_argument('--ablation-frames', type=int, default=40, help='default: %(default)s')
     parser.add_argument('--only', nargs='+', metavar='NAME', help='some of the ablations')
+    parser.add_argument('--no-ablations', action='store_true', help='leave out the first part')
     parser.add_argument('--out', type=Path, default=Path('out/paper_tables'), help='default: %(default)s')
     args = parser.parse_args()
     recordings = [args.data / KITCHEN, args.data / DESK]
@@ -119,7 +120,8 @@ def main() -> None:
         parser.error(f'{", ".join(missing)} is absent: --data or SPLATAM_DATA names the folder of the recordings')
 
     kitchen = str(recordings[0])
-    for chosen in (Set('room', 'synthetic:motion=fast'), Set('redkitchen', kitchen), Set('redkitchen_every_5th', kitchen, 5)):
+    sets = Set('room', 'synthetic:motion=fast'), Set('redkitchen', kitchen), Set('redkitchen_every_5th', kitchen, 5)
+    for chosen in () if args.no_ablations else sets:
         ablations(chosen, args)
     for title, holdout in (('Tracking and rendering', 0), (f'Held-out views: every {HOLDOUT}th frame', HOLDOUT)):
         print_header(f'{title}, preset `splatam`, width {args.width}', 1)
