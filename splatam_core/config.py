@@ -113,6 +113,9 @@ class TrackingConfig:
     )  # fmt: skip
     scale: float = _setting(1.0, 'Resolution at which frames are tracked, relative to the frame.', '', 0.05, 1.0)
     exposure: bool = _setting(True, "Of alignment: take up changes of the camera's exposure.")
+    half_render: bool = _setting(
+        False, 'Of alignment: render at half the resolution, the finest it works at; for Gaussians two pixels wide.'
+    )
     lag: bool = _setting(True, 'Of alignment: take up that colour and depth of a frame were taken at different times.')
     rotation_rate: float = _setting(4e-4, 'Adam step of the unit quaternion.', '', 0.0)
     translation_rate: float = _setting(2e-3, 'Adam step of the translation.', 'm', 0.0)

@@ -34,6 +34,7 @@ Matrix = NDArray[np.float64]
 _COARSEST_PX = 32  # smaller images show too little to align
 _EDGE = 0.05  # depth that changes by more than this share from pixel to pixel is an edge, not a surface
 _MIN_POINTS = 50
+_DEPTH_LAYER = 3
 _MIN_SCALES = 0.004, 0.001  # of brightness and of relative depth: no sensor is better
 _FIRST_SCALES = 0.1, 0.02
 _SMALL_STEP = 1e-5
@@ -53,11 +54,9 @@ class AlignmentTracker:
         self, view: View, gaussians: Gaussians, T_cam_world: Matrix, T_cam_world_before: Matrix | None = None
     ) -> TrackingResult:
         """See ``Tracker.track``."""
-        with torch.no_grad():
-            render = self._rasterizer.render(gaussians, view.camera, torch.from_numpy(T_cam_world).float())
         depth = np.where(view.valid, view.depth, np.float32(np.nan))
         frames = self._levels(_Picture(view.camera, _brightness(view.rgb8.numpy().astype(np.float32) / 255), depth))
-        references = self._levels(_reference(view.camera, render, self._config.silhouette_threshold))
+        references = self._references(gaussians, view.camera, frames[0].camera, T_cam_world)
         before = None if T_cam_world_before is None else T_cam_world @ se3.inverse(T_cam_world_before)
         alignment = self._align(references, frames, before)
         fit = alignment.fit
@@ -66,6 +65,24 @@ class AlignmentTracker:
         at_color, at_depth = alignment.state.light_motion @ T_cam_world, alignment.state.motion @ T_cam_world
         reason = failure(at_color, readings, sure_fraction, inlier_fraction, self._config)
         return TrackingResult(at_color, at_depth, sure_fraction, inlier_fraction, reason)
+
+    def _references(
+        self, gaussians: Gaussians, full: PinholeCamera, finest: PinholeCamera, T_cam_world: Matrix
+    ) -> list[_Picture]:
+        """The map from the first guess, at the resolutions of ``_levels``."""
+        camera = finest if self._config.half_render else full
+        with torch.no_grad():
+            render = self._rasterizer.render(gaussians, camera, torch.from_numpy(T_cam_world).float())
+        picture = _reference(camera, render, self._config.silhouette_threshold)
+        if camera == full:
+            return self._levels(picture)
+        picture = self._without_edges(picture)
+        return [picture, *self._halvings(picture)]
+
+    def _without_edges(self, picture: _Picture) -> _Picture:
+        """What a render blends across an edge is no surface; ``halve`` leaves it out on the way to the other levels."""
+        layers = self._aligner.layers(picture.brightness, picture.depth, _EDGE)
+        return replace(picture, depth=np.ascontiguousarray(layers[..., _DEPTH_LAYER]))
 
     def _levels(self, picture: _Picture) -> list[_Picture]:
         """The picture at a half, a quarter, ...; itself where it is too small for that.
