@@ -243,7 +243,7 @@ class SlamConfig:
 
     seed: int = _setting(0, 'Seed of every random choice.', '', 0)
     threads: int = _setting(0, 'CPU threads; 0 = all cores, 1 = repeatable bit for bit.', '', 0, 256)
-    rasterizer: str = _setting('cpu', 'Rasterizer backend.', choices=('cpu', 'reference'))
+    rasterizer: str = _setting('cpu', 'Rasterizer backend.', choices=('cpu', 'reference', 'triton'))
     depth: DepthConfig = field(default_factory=DepthConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     densification: DensificationConfig = field(default_factory=DensificationConfig)
