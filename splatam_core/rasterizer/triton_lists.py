@@ -107,7 +107,7 @@ class Capacity:
     def _take(self, entries: int) -> None:
         self._most = max(float(entries), 0.99 * self._most)
         if not 1.1 * self._most < self._room < 3 * self._most:
-            self._room = max(1024, int(1.4 * self._most))
+            self._room = max(1024, round(1.4 * self._most))
 
 
 def _read_back(total: Tensor) -> tuple[Tensor, torch.cuda.Event | None]:
