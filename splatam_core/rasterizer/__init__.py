@@ -17,8 +17,8 @@ def make_rasterizer(name: str, threads: int = 0) -> Rasterizer:
     """A backend by its name.
 
     Args:
-        name: as in the configuration, but not ``auto``.
-        threads: CPU threads; 0 = all cores.
+        name: ``cpu``, ``reference`` or ``triton``; what the configuration's ``auto`` means, ``rasterizer_for`` knows.
+        threads: CPU threads of ``cpu``; 0 = all cores.
     """
     return _BACKENDS[name](threads)
 
@@ -45,4 +45,10 @@ def _reference(threads: int) -> Rasterizer:
     return ReferenceRasterizer()
 
 
-_BACKENDS = {'cpu': _cpu, 'reference': _reference}
+def _triton(threads: int) -> Rasterizer:
+    from splatam_core.rasterizer.triton import TritonRasterizer
+
+    return TritonRasterizer()
+
+
+_BACKENDS = {'cpu': _cpu, 'reference': _reference, 'triton': _triton}

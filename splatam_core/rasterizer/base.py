@@ -186,10 +186,10 @@ class Rasterizer(Protocol):
         """
         ...
 
-    def fit(self, gaussians: Gaussians, moments: Moments, rates: Rates, target: Target) -> float:
+    def fit(self, gaussians: Gaussians, moments: Moments, rates: Rates, target: Target) -> float | Tensor:
         """Take one Adam step towards a target, in place; Gaussians that get no gradient stay as they are.
 
         Returns:
-            The loss before the step.
+            The loss before the step; of a backend on a device a scalar there, so that only who reads it waits.
         """
         ...
