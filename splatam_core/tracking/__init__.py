@@ -11,8 +11,11 @@ from splatam_core.tracking.align import AlignmentTracker
 from splatam_core.tracking.base import Tracker, TrackingResult
 from splatam_core.tracking.none import NullTracker
 from splatam_core.tracking.render_and_compare import RenderAndCompareTracker
+from splatam_core.tracking.torch_aligner import TorchAligner
 
-__all__ = ['AlignmentTracker', 'NullTracker', 'RenderAndCompareTracker', 'Tracker', 'TrackingResult', 'make_tracker']
+__all__ = [
+    'AlignmentTracker', 'NullTracker', 'RenderAndCompareTracker', 'TorchAligner', 'Tracker', 'TrackingResult', 'make_tracker',
+]  # fmt: skip
 
 _TRACKERS = {
     'render_and_compare': RenderAndCompareTracker, 'align': AlignmentTracker,
