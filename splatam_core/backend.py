@@ -49,7 +49,7 @@ def choose_backend(config: SlamConfig) -> Backend:
     device, why = _device(config)
     rasterizer = {'cpu': 'cpu', 'cuda': 'triton'}[device] if config.rasterizer == 'auto' else config.rasterizer
     if rasterizer == 'triton':
-        _check_triton(device, why)
+        _check_triton(config, device, why)
     place = torch.device(device, torch.cuda.current_device()) if device == 'cuda' else torch.device(device)
     return Backend(place, rasterizer, why)
 
@@ -79,14 +79,14 @@ def _device(config: SlamConfig) -> tuple[str, str]:
         return 'cpu', f'{INTERPRET} is 1'
     if no_gpu:
         return 'cpu', no_gpu
-    if config.rasterizer == 'auto' and (no_triton := _why_no_triton()):
-        return 'cpu', no_triton
+    if config.rasterizer == 'auto' and (no_triton := _why_no_triton(config)):
+        return 'cpu', f'rasterizer triton: {no_triton}'
     return 'cuda', torch.cuda.get_device_name()
 
 
-def _check_triton(device: str, why: str) -> None:
-    if no_triton := _why_no_triton():
-        raise ConfigError(f'rasterizer = triton: {no_triton}; {_INSTALL}, or set device=cpu and rasterizer=auto')
+def _check_triton(config: SlamConfig, device: str, why: str) -> None:
+    if no_triton := _why_no_triton(config):
+        raise ConfigError(f'rasterizer = triton: {no_triton}; set device=cpu and rasterizer=auto')
     if device == 'cpu' and not _is_interpreted():
         reason = why or 'device = cpu'
         raise ConfigError(
@@ -103,8 +103,10 @@ def _why_no_gpu() -> str:
     return f'torch {torch.__version__} {built} sees no GPU'
 
 
-def _why_no_triton() -> str:
-    return '' if importlib.util.find_spec('triton') else 'triton is not installed'
+def _why_no_triton(config: SlamConfig) -> str:
+    if config.mapping.anisotropic:
+        return 'it draws no anisotropic Gaussians (mapping.anisotropic)'
+    return '' if importlib.util.find_spec('triton') else "triton is not installed, which comes with torch's CUDA builds"
 
 
 def _is_interpreted() -> bool:

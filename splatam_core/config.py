@@ -20,6 +20,10 @@ from splatam_core.resources import config_dir
 
 Value = Union[bool, int, float, str]
 
+DEVICES = ('auto', 'cpu', 'cuda')
+WHERE = frozenset({'device', 'rasterizer', 'keyframes.on_device'})
+"""Settings that say where SLAM is computed, not what."""
+
 
 @dataclass(frozen=True, slots=True)
 class Setting:
@@ -249,7 +253,7 @@ class SlamConfig:
     threads: int = _setting(0, 'CPU threads; 0 = all cores, 1 = repeatable bit for bit.', '', 0, 256)
     device: str = _setting(
         'auto', 'Where maps live and are computed; auto = on a GPU where torch sees one and triton is there, else cpu.',
-        choices=('auto', 'cpu', 'cuda'),
+        choices=DEVICES,
     )  # fmt: skip
     rasterizer: str = _setting(
         'auto', 'Rasterizer backend; auto = cpu (native) on the processor, triton on a GPU; reference runs on either, slowly.',
@@ -339,6 +343,11 @@ def with_values(config: SlamConfig, values: Mapping[str, object]) -> SlamConfig:
     if config.mapping.optimizer == 'fused' and config.mapping.depth_outlier_ratio > 0:
         raise ConfigError('mapping.depth_outlier_ratio: fused fitting has none; set it to 0, or mapping.optimizer=autograd')
     return config
+
+
+def computed_on(config: SlamConfig, device: str | None) -> SlamConfig:
+    """The same SLAM on another device, by that device's own rasterizer; as it was where none is named."""
+    return config if device is None else with_values(config, {'device': device, 'rasterizer': 'auto'})
 
 
 def flat_values(config: SlamConfig) -> dict[str, Value]:

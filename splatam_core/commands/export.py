@@ -64,7 +64,7 @@ def export(args: argparse.Namespace) -> int:
         raise ExportError(f"{args.file}: '{args.file.suffix}' files are not written; name it .ply")
     if args.file.exists() and not args.overwrite:
         raise ExportError(f'{args.file} exists: choose another name, or replace it with --overwrite')
-    run = open_run(args.dir)
+    run = open_run(args.dir, args.device)
     gaussians = run.read_map()
     try:
         if args.form == 'gaussians':

@@ -32,7 +32,7 @@ def render(args: argparse.Namespace) -> int:
 
     if args.no_images and args.no_video:
         raise RunFolderError('--no-images and --no-video together leave nothing to write')
-    run = open_run(args.dir)
+    run = open_run(args.dir, args.device)
     camera, (rasterizer, device) = run.camera_or_error(), rasterizer_for(run.config)
     gaussians = run.read_map().to(device)
     path = run.trajectory if args.poses is None else read_trajectory(args.poses)

@@ -34,8 +34,8 @@ Room = Callable[..., SyntheticSequence]
 FEW_STEPS = {
     'splatam': (
         'tracking.iterations=4', 'mapping.iterations=4', 'keyframes.every=2', 'tracking.depth_outlier_ratio=20',
-        'mapping.depth_outlier_ratio=20', 'mapping.prune_every=2', 'densification.scale=0.6', 'tracking.scale=0.8',
-        'tracking.extend_above_m=0.001',
+        'mapping.depth_outlier_ratio=20', 'mapping.prune_every=2', 'densification.scale=0.9',
+        'tracking.extend_above_m=0.001', 'tracking.silhouette_threshold=0.9',
     ),
     'realtime': ('mapping.first_iterations=10', 'keyframes.every=2', 'mapping.prune_share=0.0'),
 }  # fmt: skip
@@ -59,7 +59,7 @@ def _config(preset: str, *more: str) -> SlamConfig:
 
 # Of a pose from the same state, metres and radians: splatam sums float32 in another order; alignment, besides, decides by
 # single pixels (is a point that falls on the border inside?) how far its steps go, and stops short of convergence.
-TOLERANCE = {'splatam': 2e-5, 'realtime': 2e-4}
+TOLERANCE = {'splatam': 1e-4, 'realtime': 2e-4}
 
 
 @pytest.mark.parametrize('preset', FEW_STEPS)
