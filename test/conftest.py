@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
 from splatam_core.config import SlamConfig, apply_threads
 from splatam_core.datasets.synthetic import SyntheticSequence
@@ -15,8 +16,13 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Rclpy checks the fields of messages in tests; it is too slow to do so otherwise. Threads as in our processes."""
+    """Rclpy checks the fields of messages in tests; it is too slow to do so otherwise. Threads as in our processes.
+
+    Where there is no GPU, Triton interprets its kernels; it decides so when they are imported.
+    """
     os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
+    if not torch.cuda.is_available():
+        os.environ.setdefault('TRITON_INTERPRET', '1')
     apply_threads(SlamConfig())
 
 

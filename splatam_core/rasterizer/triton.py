@@ -1,4 +1,4 @@
-"""The contract on a GPU: kernels in Triton, tiles of 8x8 pixels, gradients written by hand.
+"""The contract on a GPU: kernels in Triton, gradients written by hand.
 
 Nothing waits for the device but the first view, one of a much larger map or image, and whoever reads a result. Sums are taken in a
 fixed order, so that results repeat bit for bit on the same device, with one exception: while a view needs more room than its tile
@@ -29,23 +29,24 @@ except ImportError as error:
 from splatam_core.rasterizer import triton_kernels as kernels
 from splatam_core.rasterizer.triton_lists import BLOCK, Capacity, Lister, View
 
-_INTERPRETED = not isinstance(kernels.project, triton.JITFunction)
-# Splats that a program takes at once: few stay in registers; the interpreter pays by the operation, not by its size.
-_CHUNK = 64 if _INTERPRETED else 4
+# Pixels on a tile's side, and splats that a program takes at once. On a GPU these keep to the registers, with two pixels a thread;
+# the interpreter pays by the operation, not by its size.
+_TILE, _CHUNK = (16, 128) if kernels.INTERPRETED else (8, 4)
 _MAX_STEPS = 255
 
 
 class TritonRasterizer:
     """On ``cuda`` tensors; on those of the CPU under Triton's interpreter (``TRITON_INTERPRET=1``), for tests."""
 
-    def __init__(self, capacity: Capacity | None = None) -> None:
+    def __init__(self, tile: int = _TILE, capacity: Capacity | None = None) -> None:
         """Compile nothing yet.
 
         Args:
+            tile: pixels on a side of a tile, a power of two.
             capacity: decides how much room tile lists get.
         """
-        self._lister = Lister(capacity)
-        self._corrections: Tensor | None = None
+        self._lister = Lister(tile, capacity or Capacity())
+        self._corrections: Tensor | None = None  # on the device of the last fit
 
     def render(self, gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -> Render:
         """See ``Rasterizer.render``. float32 only; a pose that lies elsewhere is brought to the Gaussians' device.
@@ -83,14 +84,14 @@ class TritonRasterizer:
         g, camera, n = gaussians, view.camera, len(gaussians)
         if self._corrections is None or self._corrections.device != g.means.device:
             self._corrections = _corrections().to(g.means.device)
-        if n:
-            kernels.update[(triton.cdiv(n, BOUNDS_BLOCK),)](
-                view.splats, view.starts, view.counts, view.total, gradients, view.pose,
-                g.means, g.log_scales, g.logit_opacities, g.rgb, moments.first_second, moments.steps, self._corrections,
-                g.means if g.bounds is None else g.bounds, n, view.capacity, camera.fx, camera.fy, camera.cx, camera.cy,
-                rates.means, rates.log_scales, rates.logit_opacities, rates.rgb,
-                HAS_BOUNDS=g.bounds is not None, BLOCK=BOUNDS_BLOCK,
-            )  # fmt: skip
+        kernels.launch(
+            kernels.update, triton.cdiv(n, BOUNDS_BLOCK),
+            view.splats, view.starts, view.counts, view.total, gradients, view.pose,
+            g.means, g.log_scales, g.logit_opacities, g.rgb, moments.first_second, moments.steps, self._corrections,
+            g.means if g.bounds is None else g.bounds, n, view.capacity, camera.fx, camera.fy, camera.cx, camera.cy,
+            rates.means, rates.log_scales, rates.logit_opacities, rates.rgb,
+            HAS_BOUNDS=g.bounds is not None, BLOCK=BOUNDS_BLOCK, warps=8,
+        )  # fmt: skip
 
 
 class _Splat(torch.autograd.Function):
@@ -103,9 +104,10 @@ class _Splat(torch.autograd.Function):
         view = lister.view(gaussians, camera, T_cam_world.detach().contiguous())
         size = camera.height, camera.width
         images = means.new_empty(3, *size), means.new_empty(size), means.new_empty(size)
-        kernels.blend[(view.num_tiles,)](
+        kernels.launch(
+            kernels.blend, view.num_tiles,
             view.splats, view.order, view.entries, view.begins, view.total, *images,
-            len(means), view.capacity, camera.width, camera.height, view.tiles_x, CHUNK=_CHUNK, num_warps=1,
+            len(means), view.capacity, camera.width, camera.height, view.tiles_x, TILE=view.tile, CHUNK=_CHUNK, warps=1,
         )  # fmt: skip
         ctx.view = view
         ctx.save_for_backward(*images)
@@ -128,27 +130,29 @@ class _Splat(torch.autograd.Function):
 def _map_gradients(view: View, images: tuple[Tensor, ...], slopes: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
     """By means [N, 3], log_scales [N, 1], logit_opacities [N], rgb [N, 3]; pose sums [programs, 12]."""
     camera, n, gradients = view.camera, len(view.splats), _cleared(view)
-    kernels.blend_backward[(view.num_tiles,)](
+    kernels.launch(
+        kernels.blend_backward, view.num_tiles,
         view.splats, view.order, view.entries, view.slots, view.begins, view.total, *images, *slopes, gradients,
-        n, view.capacity, camera.width, camera.height, view.tiles_x, CHUNK=_CHUNK, num_warps=1,
+        n, view.capacity, camera.width, camera.height, view.tiles_x, TILE=view.tile, CHUNK=_CHUNK, warps=1,
     )  # fmt: skip
     new, programs = view.splats.new_empty, triton.cdiv(n, BLOCK)
     outputs = new(n, 3), new(n, 1), new(n), new(n, 3), new(programs, 12)
-    if n:
-        kernels.project_backward[(programs,)](
-            view.splats, view.starts, view.counts, view.total, gradients, view.pose, *outputs,
-            n, view.capacity, camera.fx, camera.fy, camera.cx, camera.cy, BLOCK=BLOCK,
-        )  # fmt: skip
+    kernels.launch(
+        kernels.project_backward, programs,
+        view.splats, view.starts, view.counts, view.total, gradients, view.pose, *outputs,
+        n, view.capacity, camera.fx, camera.fy, camera.cx, camera.cy, BLOCK=BLOCK, warps=4,
+    )  # fmt: skip
     return outputs
 
 
 def _pose_sums(view: View, images: tuple[Tensor, ...], slopes: tuple[Tensor, ...]) -> Tensor:
     """[tiles, 12]."""
     camera, sums = view.camera, view.splats.new_empty(view.num_tiles, 12)
-    kernels.blend_backward_to_pose[(view.num_tiles,)](
+    kernels.launch(
+        kernels.blend_backward_to_pose, view.num_tiles,
         view.splats, view.order, view.entries, view.begins, view.total, *images, *slopes, sums,
         len(view.splats), view.capacity, camera.width, camera.height, view.tiles_x,
-        camera.fx, camera.fy, camera.cx, camera.cy, CHUNK=_CHUNK, num_warps=1,
+        camera.fx, camera.fy, camera.cx, camera.cy, TILE=view.tile, CHUNK=_CHUNK, warps=1,
     )  # fmt: skip
     return sums
 
@@ -171,18 +175,22 @@ def _cleared(view: View) -> Tensor:
     rows = max(view.capacity, len(view.splats))
     gradients = view.splats.new_empty(rows, 8)
     block = 4096
-    kernels.clear_if_overflown[(triton.cdiv(8 * rows, block),)](gradients, view.total, rows, view.capacity, BLOCK=block)
+    kernels.launch(
+        kernels.clear_if_overflown, triton.cdiv(8 * rows, block),
+        gradients, view.total, rows, view.capacity, BLOCK=block, warps=4,
+    )  # fmt: skip
     return gradients
 
 
 def _fit_tiles(view: View, target: Target, gradients: Tensor) -> Tensor:
     """[tiles] losses; gradients of the entries."""
     camera, losses = view.camera, view.splats.new_empty(view.num_tiles)
-    kernels.fit_tile[(view.num_tiles,)](
+    kernels.launch(
+        kernels.fit_tile, view.num_tiles,
         view.splats, view.order, view.entries, view.slots, view.begins, view.total,
         target.rgb8, target.depth, torch.count_nonzero(target.depth), gradients, losses,
         len(view.splats), view.capacity, camera.width, camera.height, view.tiles_x,
-        target.color_weight / (3 * camera.width * camera.height), target.depth_weight, CHUNK=_CHUNK, num_warps=1,
+        target.color_weight / (3 * camera.width * camera.height), target.depth_weight, TILE=view.tile, CHUNK=_CHUNK, warps=1,
     )  # fmt: skip
     return losses
 
@@ -207,7 +215,7 @@ def _check(gaussians: Gaussians, T_cam_world: Tensor) -> None:
 
 
 def _check_device(device: torch.device) -> None:
-    if device.type != 'cuda' and not (_INTERPRETED and device.type == 'cpu'):
+    if device.type != 'cuda' and not (kernels.INTERPRETED and device.type == 'cpu'):
         found = 'a CUDA device' if torch.cuda.is_available() else 'no CUDA device'
         raise RasterizerError(
             f'the Gaussians are on {device}; the triton rasterizer takes them on cuda (torch finds {found}), on the CPU only '

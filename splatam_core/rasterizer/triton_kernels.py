@@ -1,11 +1,10 @@
 """The kernels of the ``triton`` rasterizer: project, list, blend, and the same way back.
 
-One program blends one tile of 8x8 pixels, two a thread, a chunk of Gaussians at a time: within a chunk the transmittance in front
-of each is a running product. Gradients of a list's entries go to the places which the entries had before they were sorted by tile:
+One program blends one tile, a chunk of Gaussians at a time: within a chunk the transmittance in front of each is a running product. Gradients of a list's entries go to the places which the entries had before they were sorted by tile:
 there those of one Gaussian lie side by side, and are summed without atomics.
 
-An isotropic footprint is separable, but not to advantage here: the two pixels of a thread share a column, so three exponentials
-would take the place of two.
+An isotropic footprint is separable, but not to advantage here: a tile of 8x8 pixels is two a thread, which share a column, so three
+exponentials would take the place of two.
 
 Written so that Triton's compiler and its interpreter both take them: blocks are powers of two, every load and store is masked or
 known to be inside, loops are ``while`` over scalars.
@@ -13,12 +12,13 @@ known to be inside, loops are ``while`` over scalars.
 
 from __future__ import annotations
 
+from typing import Any
+
 import triton
 import triton.language as tl
 
 from splatam_core.rasterizer import base
 
-TILE = 8  # pixels on a side
 NEAR_M = tl.constexpr(base.NEAR_M)
 FAR_M = tl.constexpr(1e30)  # what is not finite is not drawn
 BLUR_PX2 = tl.constexpr(base.BLUR_PX2)
@@ -26,14 +26,20 @@ MAX_ALPHA = tl.constexpr(base.MAX_ALPHA)
 MIN_ALPHA = tl.constexpr(base.MIN_ALPHA)
 MIN_TRANSMITTANCE = tl.constexpr(base.MIN_TRANSMITTANCE)
 BETA_1, BETA_2, EPSILON = tl.constexpr(base.BETA_1), tl.constexpr(base.BETA_2), tl.constexpr(base.EPSILON)
-SIZE = tl.constexpr(TILE)
 FIELDS = tl.constexpr(8)  # of a splat (u, v, falloff, opacity, r, g, b, z) and of its gradient, as in csrc/kernels.hpp
+
+
+def launch(kernel: Any, programs: int, *arguments: object, warps: int, **constants: int) -> None:
+    """Start a kernel; nothing where there is nothing to do. A program has ``warps`` of 32 threads (AMD: 64)."""
+    if programs:
+        # Fused multiply-adds are Triton's default up to 3.9, and should stay.
+        kernel[(programs,)](*arguments, num_warps=warps, enable_fp_fusion=True, **constants)
 
 
 @triton.jit(do_not_specialize=['n'])
 def project(
     means, log_scales, logit_opacities, rgb, pose, splats, depths, rects, counts,
-    n, width, height, fx, fy, cx, cy, BLOCK: tl.constexpr,
+    n, width, height, fx, fy, cx, cy, TILE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Gaussians onto the image: splats [N, 8], depths [N] (inf = not drawn), rects [N, 2] (see ``_pack``), tiles touched [N]."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -47,10 +53,10 @@ def project(
     sigma = 0.5 * (fx + fy) * tl.exp(tl.minimum(log_scale, 40.0)) / z
     variance = sigma * sigma + BLUR_PX2
     opacity = 1.0 / (1.0 + tl.exp(tl.minimum(-tl.load(logit_opacities + i, mask=near, other=0.0), 80.0)))
-    extent = tl.sqrt(2.0 * variance * tl.log(tl.maximum(opacity / MIN_ALPHA, 1.0))) * 1.00001
+    extent = tl.sqrt(2.0 * variance * (tl.log(tl.maximum(opacity / MIN_ALPHA, 1.0)) + 1e-5))
     drawn = near & (opacity >= MIN_ALPHA)
     drawn = drawn & (u + extent >= 0.0) & (u - extent <= width - 1.0) & (v + extent >= 0.0) & (v - extent <= height - 1.0)
-    first, shape, count = _touched_tiles(tl.where(drawn, u, 0.0), tl.where(drawn, v, 0.0), tl.where(drawn, extent, 0.0), width, height)
+    first, shape, count = _touched_tiles(tl.where(drawn, u, 0.0), tl.where(drawn, v, 0.0), tl.where(drawn, extent, 0.0), width, height, TILE)
     tl.store(rects + 2 * i, tl.where(drawn, first, 0), mask=real)
     tl.store(rects + 2 * i + 1, tl.where(drawn, shape, 0), mask=real)
     tl.store(counts + i, tl.where(drawn, count, 0), mask=real)
@@ -84,17 +90,17 @@ def _store_splat(record, u, v, falloff, opacity, z, rgb, real, drawn):
 
 
 @triton.jit
-def _touched_tiles(u, v, extent, width, height):
+def _touched_tiles(u, v, extent, width, height, TILE: tl.constexpr):
     """The tiles a disc touches, packed, and how many they are: a rectangle less the corners which the disc misses."""
-    x0 = tl.minimum(tl.maximum(u - extent, 0.0), width - 1.0).to(tl.int32) // SIZE
-    x1 = tl.minimum(tl.maximum(u + extent, 0.0), width - 1.0).to(tl.int32) // SIZE
-    y0 = tl.minimum(tl.maximum(v - extent, 0.0), height - 1.0).to(tl.int32) // SIZE
-    y1 = tl.minimum(tl.maximum(v + extent, 0.0), height - 1.0).to(tl.int32) // SIZE
+    x0 = tl.minimum(tl.maximum(u - extent, 0.0), width - 1.0).to(tl.int32) // TILE
+    x1 = tl.minimum(tl.maximum(u + extent, 0.0), width - 1.0).to(tl.int32) // TILE
+    y0 = tl.minimum(tl.maximum(v - extent, 0.0), height - 1.0).to(tl.int32) // TILE
+    y1 = tl.minimum(tl.maximum(v + extent, 0.0), height - 1.0).to(tl.int32) // TILE
     # From the centre to the nearest pixel of the outer columns and rows.
-    left = tl.maximum(u - (x0 * SIZE + SIZE - 1), 0.0)
-    right = tl.maximum(x1 * SIZE - u, 0.0)
-    above = tl.maximum(v - (y0 * SIZE + SIZE - 1), 0.0)
-    below = tl.maximum(y1 * SIZE - v, 0.0)
+    left = tl.maximum(u - (x0 * TILE + TILE - 1), 0.0)
+    right = tl.maximum(x1 * TILE - u, 0.0)
+    above = tl.maximum(v - (y0 * TILE + TILE - 1), 0.0)
+    below = tl.maximum(y1 * TILE - v, 0.0)
     limit = extent * extent
     cornered = (x1 > x0) & (y1 > y0)
     top_left = (cornered & (left * left + above * above > limit)).to(tl.int32)
@@ -178,12 +184,12 @@ def _weights(raw, T):
 
 
 @triton.jit
-def _pixels(tiles_x, width, height):
+def _pixels(tiles_x, width, height, TILE: tl.constexpr):
     """[P] columns and rows of this program's pixels, and which are on the image."""
     tile = tl.program_id(0)
-    pixel = tl.arange(0, SIZE * SIZE)
-    x = tile % tiles_x * SIZE + pixel % SIZE
-    y = tile // tiles_x * SIZE + pixel // SIZE
+    pixel = tl.arange(0, TILE * TILE)
+    x = tile % tiles_x * TILE + pixel % TILE
+    y = tile // tiles_x * TILE + pixel // TILE
     return x, y, (x < width) & (y < height)
 
 
@@ -212,10 +218,10 @@ def _blend(splats, order, entries, begin, end, n, fits, x, y, on_image, CHUNK: t
 @triton.jit(do_not_specialize=['n', 'capacity'])
 def blend(
     splats, order, entries, begins, total, rgb, depth_acc, silhouette,
-    n, capacity, width, height, tiles_x, CHUNK: tl.constexpr,
+    n, capacity, width, height, tiles_x, TILE: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
     """A tile's pixels of the images, planar: rgb [3, H, W], depth_acc and silhouette [H, W]."""
-    column, row, on_image = _pixels(tiles_x, width, height)
+    column, row, on_image = _pixels(tiles_x, width, height, TILE)
     x, y = column.to(tl.float32), row.to(tl.float32)
     begin, end, fits = _span(begins, total, tl.program_id(0), n, capacity)
     r, g, b, d, s = _blend(splats, order, entries, begin, end, n, fits, x, y, on_image, CHUNK)
@@ -331,10 +337,10 @@ def _load_slopes(rgb, depth_acc, silhouette, at, plane, on_image):
 @triton.jit(do_not_specialize=['n', 'capacity'])
 def blend_backward(
     splats, order, entries, slots, begins, total, rgb, depth_acc, silhouette, by_rgb, by_depth_acc, by_silhouette, gradients,
-    n, capacity, width, height, tiles_x, CHUNK: tl.constexpr,
+    n, capacity, width, height, tiles_x, TILE: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
     """From gradients by a tile's pixels to gradients of its list's entries."""
-    column, row, on_image = _pixels(tiles_x, width, height)
+    column, row, on_image = _pixels(tiles_x, width, height, TILE)
     at, plane = row * width + column, width * height
     r, g, b, d, s = _load_slopes(rgb, depth_acc, silhouette, at, plane, on_image)
     gr, gg, gb, gd, gs = _load_slopes(by_rgb, by_depth_acc, by_silhouette, at, plane, on_image)
@@ -348,10 +354,10 @@ def blend_backward(
 @triton.jit(do_not_specialize=['n', 'capacity'])
 def blend_backward_to_pose(
     splats, order, entries, begins, total, rgb, depth_acc, silhouette, by_rgb, by_depth_acc, by_silhouette, pose_sums,
-    n, capacity, width, height, tiles_x, fx, fy, cx, cy, CHUNK: tl.constexpr,
+    n, capacity, width, height, tiles_x, fx, fy, cx, cy, TILE: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
     """From gradients by a tile's pixels to pose_sums [tiles, 12] (see ``_store_pose_sums``); no Gaussian keeps one of its own."""
-    column, row, on_image = _pixels(tiles_x, width, height)
+    column, row, on_image = _pixels(tiles_x, width, height, TILE)
     at_pixel, plane = row * width + column, width * height
     r, g, b, d, s = _load_slopes(rgb, depth_acc, silhouette, at_pixel, plane, on_image)
     gr, gg, gb, gd, gs = _load_slopes(by_rgb, by_depth_acc, by_silhouette, at_pixel, plane, on_image)
@@ -490,10 +496,10 @@ def _difference(drawn, wanted, weight, counted):
 @triton.jit(do_not_specialize=['n', 'capacity'])
 def fit_tile(
     splats, order, entries, slots, begins, total, rgb8, depth, readings, gradients, losses,
-    n, capacity, width, height, tiles_x, color_weight, depth_weight, CHUNK: tl.constexpr,
+    n, capacity, width, height, tiles_x, color_weight, depth_weight, TILE: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
     """Blend a tile, compare it with the target rgb8 [H, W, 3] and depth [H, W] (L1), and go back, in one go; losses [tiles]."""
-    column, row, on_image = _pixels(tiles_x, width, height)
+    column, row, on_image = _pixels(tiles_x, width, height, TILE)
     x, y, at = column.to(tl.float32), row.to(tl.float32), row * width + column
     begin, end, fits = _span(begins, total, tl.program_id(0), n, capacity)
     r, g, b, d, s = _blend(splats, order, entries, begin, end, n, fits, x, y, on_image, CHUNK)
@@ -573,3 +579,6 @@ def _lower(bound, value, seen):
 @triton.jit
 def _raise(bound, value, seen):
     tl.store(bound, tl.maximum(tl.load(bound), tl.max(tl.where(seen, value, float('-inf')), axis=0)))
+
+
+INTERPRETED = not isinstance(project, triton.JITFunction)

@@ -13,7 +13,7 @@ from splatam_core.errors import RasterizerError
 from splatam_core.rasterizer import triton_kernels as kernels
 from splatam_core.rasterizer.base import Gaussians
 
-BLOCK = 256  # Gaussians a program
+BLOCK = 1024 if kernels.INTERPRETED else 256  # Gaussians a program
 MAX_TILES = 4095  # on a side: 12 bits hold them
 _MAX_SHORT = 2**15 - 1
 
@@ -33,6 +33,7 @@ class View:
         slots: [capacity] int64, where each entry was before they were sorted by tile.
         begins: [tiles + 1] int32, where each tile's entries begin.
         total: [1] int64, how many entries there should be.
+        tile: pixels on a side of a tile.
         tiles_x: tiles in a row.
     """
 
@@ -46,6 +47,7 @@ class View:
     slots: Tensor
     begins: Tensor
     total: Tensor
+    tile: int
     tiles_x: int
 
     @property
@@ -86,17 +88,26 @@ class Capacity:
             self._measured = max(num_gaussians, known_gaussians), max(num_tiles, known_tiles)
             self._reading = None
             self._take(int(total))
-        elif self._reading is not None and (self._reading[1] is None or self._reading[1].query()):
-            self._take(int(self._reading[0]))
-            self._reading = None
+        elif (entries := self._read()) is not None:
+            self._take(entries)
         if self._reading is None:
             self._reading = _read_back(total)
         return self._room
 
+    def _read(self) -> int | None:
+        """The entries of the view that is being read back, once the number has arrived."""
+        if self._reading is None:
+            return None
+        total, arrival = self._reading
+        if arrival is not None and not arrival.query():
+            return None
+        self._reading = None
+        return int(total)
+
     def _take(self, entries: int) -> None:
         self._most = max(float(entries), 0.99 * self._most)
         if not 1.1 * self._most < self._room < 3 * self._most:
-            self._room = max(1024, int(1.4 * self._most))
+            self._room = max(1024, round(1.4 * self._most))
 
 
 def _read_back(total: Tensor) -> tuple[Tensor, torch.cuda.Event | None]:
@@ -112,8 +123,9 @@ def _read_back(total: Tensor) -> tuple[Tensor, torch.cuda.Event | None]:
 class Lister:
     """Makes views. The memory comes from torch's caching allocator, which hands the same blocks out again and again."""
 
-    def __init__(self, capacity: Capacity | None = None) -> None:
-        self._capacity = capacity or Capacity()
+    def __init__(self, tile: int, capacity: Capacity) -> None:
+        self._tile = tile
+        self._capacity = capacity
         self._tile_ids: Tensor | None = None  # 0 to the number of tiles
 
     def view(self, gaussians: Gaussians, camera: PinholeCamera, pose: Tensor) -> View:
@@ -129,13 +141,13 @@ class Lister:
         Raises:
             RasterizerError: the image is too large.
         """
-        tiles_x, tiles_y = (-(-size // kernels.TILE) for size in (camera.width, camera.height))
+        tiles_x, tiles_y = (-(-size // self._tile) for size in (camera.width, camera.height))
         if max(tiles_x, tiles_y) > MAX_TILES:
             raise RasterizerError(
                 f'a {camera.width}x{camera.height} image is too large; the triton rasterizer draws up to '
-                f'{MAX_TILES * kernels.TILE} pixels on a side'
+                f'{MAX_TILES * self._tile} pixels on a side'
             )
-        splats, depths, rects, counts = _projected(gaussians, camera, pose)
+        splats, depths, rects, counts = _projected(gaussians, camera, pose, self._tile)
         order = torch.sort(depths, stable=True).indices
         ends = torch.cumsum(counts[order], dim=0, dtype=torch.int64)
         total = ends[-1:] if len(order) else ends.new_zeros(1)
@@ -143,7 +155,7 @@ class Lister:
         starts, tiles, ids = _listed(order, ends, counts, rects, capacity, tiles_x, tiles_x * tiles_y)
         tiles, slots = torch.sort(tiles, stable=True)
         begins = torch.searchsorted(tiles, self._all_tiles(tiles, tiles_x * tiles_y), out_int32=True)
-        return View(camera, pose, splats, counts, starts, order, ids[slots], slots, begins, total, tiles_x)
+        return View(camera, pose, splats, counts, starts, order, ids[slots], slots, begins, total, self._tile, tiles_x)
 
     def _all_tiles(self, like: Tensor, num_tiles: int) -> Tensor:
         """[tiles + 1], made once."""
@@ -153,16 +165,18 @@ class Lister:
         return made
 
 
-def _projected(gaussians: Gaussians, camera: PinholeCamera, pose: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _projected(
+    gaussians: Gaussians, camera: PinholeCamera, pose: Tensor, tile: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Splats [N, 8], depths [N], rects [N, 2], counts [N]."""
     n, means = len(gaussians), gaussians.means
     splats, depths = means.new_empty(n, 8), means.new_empty(n)
     rects, counts = means.new_empty(n, 2, dtype=torch.int32), means.new_empty(n, dtype=torch.int32)
-    if n:
-        kernels.project[(triton.cdiv(n, BLOCK),)](
-            means, gaussians.log_scales, gaussians.logit_opacities, gaussians.rgb, pose, splats, depths, rects, counts,
-            n, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, BLOCK=BLOCK,
-        )  # fmt: skip
+    kernels.launch(
+        kernels.project, triton.cdiv(n, BLOCK),
+        means, gaussians.log_scales, gaussians.logit_opacities, gaussians.rgb, pose, splats, depths, rects, counts,
+        n, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, TILE=tile, BLOCK=BLOCK, warps=4,
+    )  # fmt: skip
     return splats, depths, rects, counts
 
 
@@ -173,8 +187,8 @@ def _listed(
     dtype = torch.int16 if num_tiles <= _MAX_SHORT else torch.int32
     tiles = torch.full((capacity,), num_tiles, dtype=dtype, device=order.device)
     ids, starts = torch.zeros(capacity, dtype=torch.int32, device=order.device), torch.empty_like(order)
-    if len(order):
-        kernels.list_tiles[(triton.cdiv(len(order), BLOCK),)](
-            order, ends, counts, rects, starts, tiles, ids, len(order), capacity, tiles_x, BLOCK=BLOCK
-        )
+    kernels.launch(
+        kernels.list_tiles, triton.cdiv(len(order), BLOCK),
+        order, ends, counts, rects, starts, tiles, ids, len(order), capacity, tiles_x, BLOCK=BLOCK, warps=4,
+    )  # fmt: skip
     return starts, tiles, ids

@@ -84,6 +84,17 @@ def images(render: Render) -> Tensor:
     return torch.cat([render.rgb, render.depth_acc[None], render.silhouette[None]])
 
 
+def device_of(backend: str) -> str:
+    """Where a backend's tensors have to be: ``triton`` runs on a GPU where there is one, else in its interpreter."""
+    return 'cuda' if backend == 'triton' and torch.cuda.is_available() else 'cpu'
+
+
+def on_device(gaussians: Gaussians, device: str) -> Gaussians:
+    """Float32 copies there, without gradients."""
+    copies = (getattr(gaussians, name).to(device, torch.float32, copy=True) for name in parameters(gaussians))
+    return Gaussians(**dict(zip(parameters(gaussians), copies)))
+
+
 def clear_pixels(scene: Scene) -> Tensor:
     """[H, W] pixels where no alpha and no transmittance is so near a threshold that rounding could cross it.
 
@@ -98,14 +109,15 @@ def clear_pixels(scene: Scene) -> Tensor:
 
 
 def render_with_gradients(
-    rasterizer: Rasterizer, scene: Scene, dtype: torch.dtype, weights: Tensor
+    rasterizer: Rasterizer, scene: Scene, dtype: torch.dtype, weights: Tensor, device: str = 'cpu'
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The images, and the gradient of their weighted sum by every input (``T_cam_world``: upper three rows)."""
-    leaves = {name: getattr(scene.gaussians, name).to(dtype).clone().requires_grad_() for name in parameters(scene.gaussians)}
-    T = scene.T_cam_world.to(dtype).clone().requires_grad_()
+    """The images, and the gradient of their weighted sum by every input (``T_cam_world``: upper three rows); on the CPU."""
+    names = parameters(scene.gaussians)
+    leaves = {name: getattr(scene.gaussians, name).to(device, dtype, copy=True).requires_grad_() for name in names}
+    T = scene.T_cam_world.to(device, dtype, copy=True).requires_grad_()
     image = images(rasterizer.render(Gaussians(**leaves), scene.camera, T))
-    (image * weights.to(dtype)).sum().backward()
+    (image * weights.to(device, dtype)).sum().backward()
     zero = {name: torch.zeros_like(leaf) for name, leaf in leaves.items()}
     gradients = {name: zero[name] if leaf.grad is None else leaf.grad for name, leaf in leaves.items()}
     gradients['T_cam_world'] = torch.zeros(3, 4, dtype=dtype) if T.grad is None else T.grad[:3]
-    return image.detach(), gradients
+    return image.detach().cpu(), {name: gradient.cpu() for name, gradient in gradients.items()}

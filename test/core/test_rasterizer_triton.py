@@ -1,0 +1,279 @@
+"""What is the Triton backend's own: room for tile lists, the pose-only path, what it refuses, and that the compiler takes it.
+
+The contract, and agreement with the reference, is in ``test_rasterizer_contract.py``.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterizer_scenes as scenes
+import torch
+from rasterizer_scenes import Scene
+
+from splatam_core.config import load_config
+from splatam_core.datasets.synthetic import SyntheticSequence
+from splatam_core.errors import RasterizerError
+from splatam_core.gaussian_map import GaussianMap
+from splatam_core.rasterizer import Gaussians, Moments, Rates, Target, make_rasterizer
+from splatam_core.rasterizer.triton import TritonRasterizer
+from splatam_core.rasterizer.triton_lists import Capacity
+from splatam_core.slam import Slam
+from splatam_core.types import Status
+
+ROOT = Path(__file__).resolve().parents[2]
+DEVICE = scenes.device_of('triton')
+RATES = Rates(means=1e-4, log_scales=1e-3, logit_opacities=0.05, rgb=2.5e-3)
+SCENE = scenes.random_scene(51, 90, 26, 19)
+
+
+class Room(Capacity):
+    """Always the same room, enough or not."""
+
+    def __init__(self, entries: int) -> None:
+        super().__init__()
+        self.entries = entries
+
+    def of(self, total: torch.Tensor, num_gaussians: int, num_tiles: int) -> int:
+        assert int(total) > 100  # else the tests below would not overflow
+        return self.entries
+
+
+def _weights(scene: Scene) -> torch.Tensor:
+    return torch.randn(5, scene.camera.height, scene.camera.width, generator=torch.Generator().manual_seed(0))
+
+
+def _pose_gradient(rasterizer: TritonRasterizer, scene: Scene, wants_means: bool) -> torch.Tensor:
+    gaussians, pose = scenes.on_device(scene.gaussians, DEVICE), scene.T_cam_world.to(DEVICE, torch.float32).requires_grad_()
+    gaussians.means.requires_grad_(wants_means)
+    image = scenes.images(rasterizer.render(gaussians, scene.camera, pose))
+    (image * _weights(scene).to(DEVICE)).sum().backward()
+    assert (gaussians.means.grad is not None) == wants_means
+    return pose.grad.cpu()
+
+
+def test_the_pose_alone_gets_the_gradient_that_it_gets_beside_the_map() -> None:
+    """Summed pixel by pixel, or Gaussian by Gaussian: the same to float32. The last row is constant."""
+    beside, alone = (_pose_gradient(TritonRasterizer(), SCENE, wants_means) for wants_means in (True, False))
+    assert float((alone - beside).abs().max()) < 1e-5 * float(beside.abs().max())
+    assert not alone[3].any() and alone[:3].all()
+
+
+def test_lists_without_room_change_nothing_but_the_time() -> None:
+    """Image, gradients by map and pose, and a fitting step, where not one tile's list is whole."""
+    roomy, cramped = TritonRasterizer(), TritonRasterizer(capacity=Room(16))
+    image, gradients = scenes.render_with_gradients(roomy, SCENE, torch.float32, _weights(SCENE), DEVICE)
+    same_image, same_gradients = scenes.render_with_gradients(cramped, SCENE, torch.float32, _weights(SCENE), DEVICE)
+    torch.testing.assert_close(same_image, image, rtol=0, atol=1e-5)
+    for name, gradient in gradients.items():
+        assert float((same_gradients[name] - gradient).abs().max()) < 5e-5 * float(gradient.abs().max()), name
+    alone = _pose_gradient(cramped, SCENE, wants_means=False)
+    assert float((alone[:3] - gradients['T_cam_world']).abs().max()) < 5e-5 * float(gradients['T_cam_world'].abs().max())
+    loss, first = _fit(roomy, SCENE)
+    same_loss, same_first = _fit(cramped, SCENE)
+    assert same_loss == pytest.approx(loss, rel=1e-5)
+    assert float((same_first - first).abs().max()) < 1e-3 * float(first.abs().max())  # an L1's sign may turn at a pixel
+
+
+def _fit(rasterizer: TritonRasterizer, scene: Scene) -> tuple[float, torch.Tensor]:
+    """Loss, and first moments of one step: gradients, that is."""
+    count = len(scene.gaussians)
+    moments = Moments(torch.zeros(count, 16, device=DEVICE), torch.zeros(count, dtype=torch.uint8, device=DEVICE))
+    loss = rasterizer.fit(scenes.on_device(scene.gaussians, DEVICE), moments, RATES, _target(scene))
+    return float(loss), moments.first_second[:, :8].cpu()
+
+
+def _target(scene: Scene) -> Target:
+    camera = scene.camera
+    rgb8 = torch.full((camera.height, camera.width, 3), 90, dtype=torch.uint8, device=DEVICE)
+    depth = torch.full((camera.height, camera.width), 2.0, device=DEVICE)
+    return Target(camera, rgb8, depth, scene.T_cam_world.float(), 0.5, 1.0)
+
+
+def test_room_is_two_fifths_more_than_was_seen_and_is_learned_a_view_later() -> None:
+    """The first view is waited for; growth shows on the view after; a much larger map is waited for again."""
+    capacity = Capacity()
+
+    def room(entries: int, gaussians: int = 1000) -> int:
+        return capacity.of(torch.tensor([entries]), gaussians, 100)  # tensors of the CPU arrive at once
+
+    assert room(10_000) == 14_000
+    assert room(15_000) == 14_000 and room(15_000) == 21_000
+    assert room(20_000) == 21_000 and room(20_000) == 28_000
+    assert room(100_000, gaussians=1300) == 140_000
+    steady = [room(10_000, gaussians=1300) for _ in range(300)]
+    assert steady[0] == 140_000 and steady[-1] < 31_000  # memory is given back in time
+
+
+@pytest.mark.parametrize('tile', [8, 32])
+def test_the_size_of_tiles_changes_nothing(tile: int) -> None:
+    image, gradients = scenes.render_with_gradients(TritonRasterizer(), SCENE, torch.float32, _weights(SCENE), DEVICE)
+    same, same_gradients = scenes.render_with_gradients(TritonRasterizer(tile), SCENE, torch.float32, _weights(SCENE), DEVICE)
+    torch.testing.assert_close(same, image, rtol=0, atol=1e-5)
+    for name, gradient in gradients.items():
+        assert float((same_gradients[name] - gradient).abs().max()) < 5e-5 * float(gradient.abs().max()), name
+
+
+def test_the_same_again_bit_for_bit() -> None:
+    """No sum depends on which program comes first."""
+    runs = [scenes.render_with_gradients(TritonRasterizer(), SCENE, torch.float32, _weights(SCENE), DEVICE) for _ in range(2)]
+    assert torch.equal(runs[0][0], runs[1][0])
+    assert all(torch.equal(gradient, runs[1][1][name]) for name, gradient in runs[0][1].items())
+
+
+def test_equal_depths_keep_the_order_of_the_map() -> None:
+    """Of two Gaussians in one place the first in the map is in front."""
+    camera = scenes.camera(9, 9)
+    one = scenes.one((0.0, 0.0, 2.0), 1.0, 0.9, camera).gaussians
+    for order in ([1.0, 0.0], [0.0, 1.0]):
+        rgb = torch.tensor([[red, 0.0, 1.0 - red] for red in order])
+        both = Gaussians(one.means.repeat(2, 1), one.log_scales.repeat(2, 1), one.logit_opacities.repeat(2), rgb)
+        render = TritonRasterizer().render(scenes.on_device(both, DEVICE), camera, torch.eye(4))
+        red, _, blue = render.rgb[:, 4, 4].tolist()
+        assert (red > 2 * blue) == (order[0] == 1.0)
+
+
+def test_bounds_grow_with_what_is_fitted() -> None:
+    """So that a map can go back to a rasterizer which skips what is out of view."""
+    gaussians = GaussianMap()
+    gaussians.append(scenes.on_device(SCENE.gaussians, 'cpu'))
+    g = gaussians.gaussians
+    on_device = Gaussians(*(values.to(DEVICE) for values in (g.means, g.log_scales, g.logit_opacities, g.rgb, g.bounds)))
+    before = on_device.bounds.clone()
+    moments = Moments(torch.zeros(len(g), 16, device=DEVICE), torch.zeros(len(g), dtype=torch.uint8, device=DEVICE))
+    for _ in range(2):
+        TritonRasterizer().fit(on_device, moments, Rates(0.05, 0.1, 0.05, 0.01), _target(SCENE))
+    lowest, highest = on_device.means.amin(dim=0), on_device.means.amax(dim=0)
+    bounds = on_device.bounds[0]
+    assert (bounds[:3] <= lowest).all() and (bounds[3:6] >= highest).all() and bounds[6] >= on_device.log_scales.max()
+    assert (bounds[:3] <= before[0, :3]).all() and (bounds[3:] >= before[0, 3:]).all() and not torch.equal(bounds, before[0])
+
+
+@pytest.mark.parametrize('more', [['densification.scale=0.6'], ['mapping.optimizer=fused', 'mapping.first_iterations=3']])
+def test_ten_frames_find_the_poses_of_the_cpu(room: Callable[..., SyntheticSequence], more: list[str]) -> None:
+    """The whole of ``Slam.process``; from the same state poses agree within 0.2 mm, the issue's limit."""
+    few = ['threads=1', 'tracking.iterations=3', 'mapping.iterations=2', 'mapping.prune_scale=1.0', 'keyframes.every=3']
+    sequence = room(10, 32, noise=False)
+    there, host = (Slam(load_config('splatam', [*few, *more, f'rasterizer={name}'])) for name in ('triton', 'cpu'))
+    for index in range(10):
+        host.restore(there.state())
+        found, expected = there.process(sequence[index]), host.process(sequence[index])
+        assert found.status is expected.status is (Status.TRACKED if index else Status.INITIALIZED)
+        assert np.abs(found.T_world_cam[:3, 3] - expected.T_world_cam[:3, 3]).max() < 2e-4
+        assert found.num_gaussians == pytest.approx(expected.num_gaussians, abs=2)  # a pixel on the silhouette's limit
+
+
+def test_anisotropic_gaussians_are_refused() -> None:
+    scene = scenes.anisotropic_scene(1, 10, 16, 12)
+    with pytest.raises(RasterizerError, match='anisotropic.*rasterizer=cpu'):
+        make_rasterizer('triton').render(scenes.on_device(scene.gaussians, DEVICE), scene.camera, torch.eye(4))
+
+
+def test_images_that_tile_numbers_cannot_hold_are_refused() -> None:
+    with pytest.raises(RasterizerError, match='too large'):
+        scene = scenes.random_scene(1, 1, 4096 * 32, 1)
+        TritonRasterizer(32).render(scenes.on_device(scene.gaussians, DEVICE), scene.camera, torch.eye(4))
+
+
+def test_fitting_refuses_what_it_could_not_write_to() -> None:
+    """A strided view would be copied, and the copy fitted."""
+    gaussians = scenes.on_device(SCENE.gaussians, DEVICE)
+    wide = torch.zeros(len(gaussians), 6, device=DEVICE)
+    strided = Gaussians(wide[:, ::2], gaussians.log_scales, gaussians.logit_opacities, gaussians.rgb)
+    moments = Moments(torch.zeros(len(gaussians), 16, device=DEVICE), torch.zeros(len(gaussians), dtype=torch.uint8, device=DEVICE))
+    with pytest.raises(RasterizerError, match='means has strides'):
+        make_rasterizer('triton').fit(strided, moments, RATES, _target(SCENE))
+
+
+def _python(code: str, *arguments: str, **environment: str) -> str:
+    """What another process prints, Triton's interpreter off."""
+    surroundings = {name: value for name, value in os.environ.items() if name != 'TRITON_INTERPRET'}
+    run = subprocess.run(
+        [sys.executable, '-W', 'ignore', '-c', code, *arguments], cwd=ROOT, capture_output=True, text=True, check=False,
+        env=surroundings | {'PYTHONPATH': str(ROOT)} | environment,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr[-4000:]
+    return run.stdout
+
+
+def test_tensors_of_the_cpu_need_the_interpreter() -> None:
+    said = _python("""
+import torch
+from splatam_core.camera import PinholeCamera
+from splatam_core.rasterizer import Gaussians, make_rasterizer
+try:
+    g = Gaussians(torch.zeros(1, 3), torch.zeros(1, 1), torch.zeros(1), torch.zeros(1, 3))
+    make_rasterizer('triton').render(g, PinholeCamera(8, 8, 8.0, 8.0, 4.0, 4.0), torch.eye(4))
+except Exception as error:
+    print(type(error).__name__, error)
+""")
+    assert said.startswith('RasterizerError the Gaussians are on cpu; the triton rasterizer takes them on cuda (torch finds ')
+    assert 'TRITON_INTERPRET=1' in said and len(said.splitlines()) == 1
+
+
+def test_without_triton_the_error_says_what_to_install() -> None:
+    said = _python("""
+import sys
+sys.modules['triton'] = None
+from splatam_core.rasterizer import make_rasterizer
+try:
+    make_rasterizer('triton')
+except Exception as error:
+    print(type(error).__name__, error)
+""")
+    assert said.startswith('RasterizerError ') and 'pip install triton' in said and len(said.splitlines()) == 1
+
+
+COMPILE = """
+import sys
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from splatam_core.rasterizer import triton_kernels as kernels
+
+POINTERS = {
+    'order': 'i64', 'ends': 'i64', 'starts': 'i64', 'slots': 'i64', 'total': 'i64', 'readings': 'i64', 'rects': 'i32',
+    'counts': 'i32', 'ids': 'i32', 'entries': 'i32', 'begins': 'i32', 'tiles': 'i16', 'rgb8': 'u8', 'steps': 'u8',
+}
+INTEGERS = {'n', 'rows', 'capacity', 'width', 'height', 'tiles_x'}
+FLOATS = {'fx', 'fy', 'cx', 'cy', 'color_weight', 'depth_weight', 'means_rate', 'log_scales_rate', 'logit_opacities_rate', 'rgb_rate'}
+CONSTANTS = {'TILE': 8, 'CHUNK': 4, 'BLOCK': 256, 'HAS_BOUNDS': True}
+
+def type_of(name):
+    if name in CONSTANTS:
+        return 'constexpr'
+    return 'i32' if name in INTEGERS else 'fp32' if name in FLOATS else '*' + POINTERS.get(name, 'fp32')
+
+backend, arch, threads, form, *names = sys.argv[1:]
+target = GPUTarget(backend, int(arch) if arch.isdigit() else arch, int(threads))
+for name in names:
+    kernel = getattr(kernels, name)
+    constants = {name: value for name, value in CONSTANTS.items() if name in kernel.arg_names}
+    source = ASTSource(kernel, {name: type_of(name) for name in kernel.arg_names}, constants)
+    options = {'num_warps': 1 if 'CHUNK' in constants else 4, 'enable_fp_fusion': True}
+    print(name, len(triton.compile(source, target=target, options=options).asm[form]))
+"""
+LAUNCHED = (
+    'project', 'list_tiles', 'blend', 'blend_backward', 'blend_backward_to_pose', 'clear_if_overflown', 'project_backward',
+    'fit_tile', 'update',
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(('target', 'binary'), [('cuda 80 32', 'cubin'), ('hip gfx942 64', 'hsaco')])
+def test_the_compiler_takes_every_kernel(target: str, binary: str, tmp_path: Path) -> None:
+    """Ahead of time, to machine code of a card of either maker, which needs no card: the interpreter takes more than the compiler."""
+    said = _python(COMPILE, *target.split(), binary, *LAUNCHED, TRITON_CACHE_DIR=str(tmp_path))
+    sizes = dict(line.split() for line in said.splitlines())
+    assert tuple(sizes) == LAUNCHED and all(int(size) > 1000 for size in sizes.values())
+
+
+def test_every_kernel_that_is_launched_is_compiled_above() -> None:
+    sources = ''.join((ROOT / 'splatam_core/rasterizer' / name).read_text() for name in ('triton.py', 'triton_lists.py'))
+    launched = {line.strip().split(',')[0][len('kernels.') :] for line in sources.splitlines() if line.strip().startswith('kernels.')}
+    assert {name for name in launched if not name.startswith('launch')} == set(LAUNCHED)
