@@ -32,7 +32,7 @@ from splatam_core.config import apply_threads, load_config
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.evaluation.images import ViewScorer, mean_scores
 from splatam_core.evaluation.trajectory import trajectory_error
-from splatam_core.rasterizer import make_rasterizer
+from splatam_core.rasterizer import rasterizer_for
 from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame, StageTimings, Trajectory
 
@@ -126,7 +126,7 @@ def run_one(system: SimpleNamespace, source: str, width: int) -> Outcome:
     truth = sequence.ground_truth()
     psnr_db = None
     if slam is not None:
-        scorer = ViewScorer(slam.map.gaussians, make_rasterizer(slam.config.rasterizer, slam.config.threads), slam.config.depth)
+        scorer = ViewScorer(slam.map.gaussians, rasterizer_for(slam.config)[0], slam.config.depth)
         psnr_db = mean_scores(scorer.score(*pair) for pair in tracked[::SCORED_EVERY]).psnr_db
     return Outcome(
         len(frames), len(tracked), seconds, None if truth is None else 100 * trajectory_error(estimate, truth).rmse_m,

@@ -43,7 +43,7 @@ class SlamState:
         config: every setting.
         camera: of the frames; None before the first.
         map: see ``GaussianMap.arrays``.
-        keyframes: as they were kept.
+        keyframes: as they were kept, in the host's memory.
         motion: of the motion model.
         rng: of numpy's generator, as ``BitGenerator.state`` has it.
         scene_radius: metres; 0 before the first frame.

@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING
 
 from splatam_core.commands import ablations, bench, compare, convert, evaluate, export, refine, render
 from splatam_core.commands.evaluate import print_summary, score_own_run
-from splatam_core.commands.shared import Command, add_source_arguments, open_source, positive, say, source_of
+from splatam_core.commands.shared import (
+    Command,
+    add_device_argument,
+    add_source_arguments,
+    open_source,
+    positive,
+    say,
+    source_of,
+)
 from splatam_core.errors import DatasetError, FrameError, RunFolderError, SplatamError
 
 # Whatever takes time to import (torch, OpenCV, matplotlib) is imported by the command that needs it.
@@ -63,6 +71,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--set', action='append', default=[], metavar='KEY=VALUE', help='change a setting; may be given several times'
     )
+    add_device_argument(parser, 'where to compute, or with --resume to go on; the same as --set device=D')
     parser.add_argument('--out', type=Path, metavar='DIR', help='folder for the results')
     parser.add_argument('--overwrite', action='store_true', help='replace the run that is in DIR')
     parser.add_argument(
@@ -137,11 +146,12 @@ def _begin(args: argparse.Namespace) -> _Job:
 
     if args.source is None or args.out is None:
         make_parser().error('run needs SOURCE and --out DIR, or --resume DIR to go on with one')
-    held_out = [f'mapping.hold_out={args.holdout}'] if args.holdout else []
-    config = load_config(args.preset, [*args.set, *held_out])
+    given = {'mapping.hold_out': args.holdout, 'device': args.device}
+    config = load_config(args.preset, [*args.set, *(f'{name}={value}' for name, value in given.items() if value)])
     apply_threads(config)
     source = source_of(args)
     sequence, slam = prepare(open_source(source), config)
+    _say_where(slam)
     every, keep = args.checkpoint_every, args.keep_checkpoints or KEEP_CHECKPOINTS
     description = RunDescription('splatam run', args.preset, source, every, keep)
     folder = RunFolder.create(args.out, config, description, overwrite=args.overwrite)
@@ -153,7 +163,8 @@ def _resume(args: argparse.Namespace) -> _Job:
     from splatam_core.resuming import CheckpointWriter, resume
 
     _check_is_all(args)
-    run = resume(args.resume, open_source, apply_threads, say)
+    run = resume(args.resume, open_source, apply_threads, say, args.device)
+    _say_where(run.slam)
     description = run.settings.description
     every = args.checkpoint_every or description.checkpoint_every
     keep = args.keep_checkpoints or description.keep_checkpoints
@@ -162,9 +173,14 @@ def _resume(args: argparse.Namespace) -> _Job:
     return _Job(run.sequence, run.first, run.slam, run.folder, writer)
 
 
+def _say_where(slam: Slam) -> None:
+    if slam.backend.why:
+        say(str(slam.backend))
+
+
 def _check_is_all(args: argparse.Namespace) -> None:
     """Make sure that nothing was asked for that the resumed run has settled already."""
-    free = {'resume', 'run', 'checkpoint_every', 'keep_checkpoints', 'no_evaluate'}
+    free = {'resume', 'run', 'checkpoint_every', 'keep_checkpoints', 'no_evaluate', 'device'}
     defaults = make_parser().parse_args(['run'])
     given = [name for name, value in vars(args).items() if name not in free and value != getattr(defaults, name)]
     if given:

@@ -20,6 +20,10 @@ from splatam_core.resources import config_dir
 
 Value = Union[bool, int, float, str]
 
+DEVICES = ('auto', 'cpu', 'cuda')
+WHERE = frozenset({'device', 'rasterizer', 'keyframes.on_device'})
+"""Settings that say where SLAM is computed, not what."""
+
 
 @dataclass(frozen=True, slots=True)
 class Setting:
@@ -185,6 +189,10 @@ class KeyframeConfig:
     )
     overlap_samples: int = _setting(1600, 'Pixels sampled to measure overlap with a keyframe.', 'px', 1)
     overlap_margin: int = _setting(20, 'Border of a keyframe in which a sample does not count as seen.', 'px', 0)
+    on_device: int = _setting(
+        100, "Of a GPU: keyframes in its memory at most, those used last, 20 bytes a pixel each; all are in the host's.",
+        'frames', 1,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,7 +251,14 @@ class SlamConfig:
 
     seed: int = _setting(0, 'Seed of every random choice.', '', 0)
     threads: int = _setting(0, 'CPU threads; 0 = all cores, 1 = repeatable bit for bit.', '', 0, 256)
-    rasterizer: str = _setting('cpu', 'Rasterizer backend.', choices=('cpu', 'reference', 'triton'))
+    device: str = _setting(
+        'auto', 'Where maps live and are computed; auto = on a GPU where torch sees one and triton is there, else cpu.',
+        choices=DEVICES,
+    )  # fmt: skip
+    rasterizer: str = _setting(
+        'auto', 'Rasterizer backend; auto = cpu (native) on the processor, triton on a GPU; reference runs on either, slowly.',
+        choices=('auto', 'cpu', 'triton', 'reference'),
+    )  # fmt: skip
     depth: DepthConfig = field(default_factory=DepthConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     densification: DensificationConfig = field(default_factory=DensificationConfig)
@@ -316,6 +331,8 @@ def with_values(config: SlamConfig, values: Mapping[str, object]) -> SlamConfig:
         config = _replace_leaf(config, name.split('.'), known[name].check(value))
     if not config.depth.min_m < config.depth.max_m:
         raise ConfigError(f'depth.min_m = {config.depth.min_m:g}: expected less than depth.max_m = {config.depth.max_m:g}')
+    if config.device == 'cuda' and config.rasterizer == 'cpu':
+        raise ConfigError('rasterizer = cpu: runs on the processor, and device = cuda; set rasterizer=auto, or device=cpu')
     if config.mapping.hold_out == 1:
         raise ConfigError('mapping.hold_out = 1: would leave no frame for the map; expected 0 (none) or at least 2')
     if config.mapping.optimizer == 'fused' and config.mapping.anisotropic:
@@ -326,6 +343,11 @@ def with_values(config: SlamConfig, values: Mapping[str, object]) -> SlamConfig:
     if config.mapping.optimizer == 'fused' and config.mapping.depth_outlier_ratio > 0:
         raise ConfigError('mapping.depth_outlier_ratio: fused fitting has none; set it to 0, or mapping.optimizer=autograd')
     return config
+
+
+def computed_on(config: SlamConfig, device: str | None) -> SlamConfig:
+    """The same SLAM on another device, by that device's own rasterizer; as it was where none is named."""
+    return config if device is None else with_values(config, {'device': device, 'rasterizer': 'auto'})
 
 
 def flat_values(config: SlamConfig) -> dict[str, Value]:

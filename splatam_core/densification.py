@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 
-import cv2
-import numpy as np
 import torch
 from torch import Tensor
 
 from splatam_core.config import DensificationConfig
+from splatam_core.filters import box_sums, median
 from splatam_core.rasterizer import Gaussians, Rasterizer, Render, joined
 from splatam_core.view import View, unproject
 
@@ -42,11 +41,8 @@ def depth_bias(render: Render, view: View) -> Tensor:
     """
     depth = render.depth()
     compared = (view.valid & (depth > 0) & ((depth - view.depth).abs() < MAX_BIAS * view.depth)).float()
-    error, weight = (
-        cv2.boxFilter(image.numpy(), -1, (BIAS_WINDOW, BIAS_WINDOW), normalize=False, borderType=cv2.BORDER_CONSTANT)
-        for image in (compared * (depth - view.depth), compared)
-    )
-    return torch.from_numpy(error / np.maximum(weight, 1))
+    error, weight = (box_sums(image, BIAS_WINDOW) for image in (compared * (depth - view.depth), compared))
+    return error / weight.clamp(min=1)
 
 
 def unexplained(render: Render, view: View, config: DensificationConfig) -> Tensor:
@@ -58,9 +54,7 @@ def unexplained(render: Render, view: View, config: DensificationConfig) -> Tens
     depth = render.depth()
     error = (depth - view.depth).abs()
     compared = view.valid & (depth > 0)
-    if not compared.any():
-        return unmapped & view.valid
-    in_front = (depth > view.depth) & (error > config.depth_error_ratio * error[compared].median())
+    in_front = (depth > view.depth) & (error > config.depth_error_ratio * median(error, compared))
     return (unmapped | in_front) & view.valid
 
 
@@ -73,6 +67,6 @@ def new_gaussians(view: View, chosen: Tensor, depth: Tensor, T_cam_world: Tensor
     return Gaussians(
         means=(points - t) @ R,
         log_scales=torch.log(points[:, 2:] / focal),
-        logit_opacities=torch.full((len(points),), math.log(opacity / (1 - opacity))),
+        logit_opacities=points.new_full((len(points),), math.log(opacity / (1 - opacity))),
         rgb=view.rgb[:, v, u].T.contiguous(),
     )

@@ -42,13 +42,14 @@ def _git(*arguments: str) -> str | None:
         return None
 
 
-def machine() -> dict[str, str | int]:
-    """Processor, usable cores, memory and system."""
+def machine() -> dict[str, str | int | None]:
+    """Processor, usable cores, memory, system, and the GPU that torch sees, if any."""
     return {
         'system': platform.platform(),
         'processor': _processor(),
         'cores': len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1,
         'memory_mb': os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') // 2**20,
+        'gpu': torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
 
 
@@ -72,6 +73,12 @@ def peak_rss_mb() -> float | None:
     """Most memory this process held at once, MiB; None where the system does not say."""
     peak = _fields(Path('/proc/self/status')).get('VmHWM')  # unlike ru_maxrss not inherited from the parent
     return None if peak is None else round(int(peak.split()[0]) / 1024, 1)
+
+
+def peak_gpu_mb() -> float | None:
+    """Most memory this process's tensors took on a GPU at once, MiB; None where none was on one."""
+    peak = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0
+    return round(peak / 2**20, 1) if peak else None
 
 
 def rss_mb() -> float | None:

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from splatam_core import se3
+from splatam_core.backend import pose_tensor
 from splatam_core.camera import PinholeCamera
 from splatam_core.errors import ExportError
 from splatam_core.rasterizer import Gaussians, Rasterizer
@@ -48,7 +49,7 @@ def centres(gaussians: Gaussians, min_opacity: float) -> Surface:
     chosen = torch.sigmoid(g.logit_opacities) >= min_opacity
     if not chosen.any():
         raise ExportError(f'none of the {len(g)} Gaussians is at least {min_opacity:g} opaque')
-    return Surface(g.means[chosen].numpy(), g.rgb[chosen].numpy())
+    return Surface(g.means[chosen].numpy(force=True), g.rgb[chosen].numpy(force=True))
 
 
 def fused_mesh(
@@ -66,7 +67,7 @@ def fused_mesh(
     depth where the silhouette is at least one half, truncated at four voxels.
 
     Args:
-        gaussians: the map.
+        gaussians: the map, on the rasterizer's device.
         rasterizer: draws it.
         camera: what it is seen through.
         poses: [N, 4, 4] T_world_cam.
@@ -86,7 +87,8 @@ def fused_mesh(
     for index in progress(range(len(poses))):
         T_cam_world = se3.inverse(poses[index])
         with torch.no_grad():
-            view = rasterizer.render(map_only, camera, torch.from_numpy(T_cam_world).float()).images()
+            pose = pose_tensor(T_cam_world, map_only.means.device)
+            view = rasterizer.render(map_only, camera, pose).images()
         depth, color = (
             open3d.t.geometry.Image(core.Tensor(image))
             for image in (view.depth_m[..., None], view.rgb / np.float32(255))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,6 +26,75 @@ class PosedView:
 
     view: View
     T_cam_world: Tensor
+
+    def to(self, device: torch.device) -> PosedView:
+        """The same on a device; itself where it is there already."""
+        if self.view.depth.device == device:
+            return self
+        return PosedView(self.view.to(device), self.T_cam_world.to(device, non_blocking=True))
+
+
+class KeyframeStore(Sequence[PosedView]):
+    """All keyframes, in the host's memory; copies of those used last are on the device.
+
+    Attributes:
+        limit: how many may be on the device.
+    """
+
+    def __init__(self, device: torch.device, limit: int) -> None:
+        self.limit = limit
+        self._device = device
+        self._kept: list[PosedView] = []
+        self._copies: dict[PosedView, PosedView] = {}  # the last used is the last
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __getitem__(self, index: Any) -> Any:
+        """As they are kept."""
+        return self._kept[index]
+
+    def append(self, keyframe: PosedView, copy: PosedView | None = None) -> None:
+        """Keep one.
+
+        Args:
+            keyframe: in the host's memory.
+            copy: the same on the device, if it is there.
+        """
+        self._kept.append(keyframe)
+        if copy is not None and copy.view.depth.device != keyframe.view.depth.device:
+            self._remember(keyframe, copy)
+
+    def on_device(self, keyframe: PosedView) -> PosedView:
+        """A view on the device; brought there unless it is."""
+        if keyframe.view.depth.device == self._device:
+            return keyframe
+        copy = self._copies.pop(keyframe, None) or keyframe.to(self._device)
+        self._remember(keyframe, copy)
+        return copy
+
+    def window(self, views: Sequence[PosedView]) -> Window:
+        """Views, each brought to the device when it is taken."""
+        return Window(views, self)
+
+    def _remember(self, keyframe: PosedView, copy: PosedView) -> None:
+        self._copies[keyframe] = copy
+        while len(self._copies) > self.limit:
+            del self._copies[next(iter(self._copies))]
+
+
+class Window(Sequence[PosedView]):
+    """Views to map; only those that are taken from it need be on the device."""
+
+    def __init__(self, views: Sequence[PosedView], store: KeyframeStore) -> None:
+        self._views, self._store = views, store
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __getitem__(self, index: Any) -> Any:
+        """One view, on the device."""
+        return self._store.on_device(self._views[index])
 
 
 def select_window(
@@ -106,8 +176,8 @@ def sample_points(posed: PosedView, count: int, rng: np.random.Generator) -> Ten
     """[count, 3] world points of random pixels with a reading, drawn with replacement; none where none has one."""
     v, u = torch.nonzero(posed.view.valid, as_tuple=True)
     if len(u) == 0:
-        return torch.empty(0, 3)
-    drawn = torch.from_numpy(rng.integers(len(u), size=count))
+        return posed.view.depth.new_empty(0, 3)
+    drawn = torch.from_numpy(rng.integers(len(u), size=count)).to(u.device)
     points = unproject(posed.view.camera, u[drawn], v[drawn], posed.view.depth[v[drawn], u[drawn]])
     return (points - posed.T_cam_world[:3, 3]) @ posed.T_cam_world[:3, :3]
 
@@ -117,7 +187,7 @@ def overlaps(points: Tensor, keyframes: Sequence[PosedView], margin: int) -> lis
     if not len(points) or not keyframes:
         return [0.0] * len(keyframes)
     camera = keyframes[0].view.camera
-    T = torch.stack([keyframe.T_cam_world[:3] for keyframe in keyframes])  # [N, 3, 4]
+    T = torch.stack([keyframe.T_cam_world[:3] for keyframe in keyframes]).to(points.device)  # [N, 3, 4]
     x, y, z = (T[:, :, :3] @ points.T + T[:, :, 3:]).unbind(1)  # [N, K] each
     u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     inside = (u > margin) & (u < camera.width - margin) & (v > margin) & (v < camera.height - margin) & (z > 0)

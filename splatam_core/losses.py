@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import torch
 from torch import Tensor
 
 from splatam_core.config import MappingConfig, TrackingConfig
+from splatam_core.filters import blurred, median
 from splatam_core.rasterizer import Render
 from splatam_core.view import View
-
-_WINDOW = cv2.getGaussianKernel(11, 1.5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,12 +21,12 @@ class TrackingLoss:
     Attributes:
         total: sum over the pixels that count, differentiable.
         depth: the part of depth, unweighted, metres times pixels.
-        num_pixels: how many count.
+        num_pixels: how many count, a scalar on the device.
     """
 
     total: Tensor
     depth: Tensor
-    num_pixels: int
+    num_pixels: Tensor
 
 
 def tracking_loss(render: Render, view: View, config: TrackingConfig) -> TrackingLoss:
@@ -39,17 +37,17 @@ def tracking_loss(render: Render, view: View, config: TrackingConfig) -> Trackin
     counts = view.valid & (render.silhouette.detach() > config.silhouette_threshold) if config.use_silhouette else view.valid
     error = (expected_depth(render) - view.depth).abs()
     if config.depth_outlier_ratio > 0:
-        counts = counts & inliers(error.detach(), counts, config.depth_outlier_ratio)
+        counts = inliers(error.detach(), counts, config.depth_outlier_ratio)
     mask = counts.to(view.rgb.dtype)
     depth = (error * mask).sum()
     difference = (render.rgb - view.rgb).abs()
     color = (difference * mask).sum() if config.use_silhouette or config.depth_outlier_ratio > 0 else difference.sum()
-    return TrackingLoss(config.depth_weight * depth + config.color_weight * color, depth.detach(), int(counts.sum()))
+    return TrackingLoss(config.depth_weight * depth + config.color_weight * color, depth.detach(), counts.sum())
 
 
 def inliers(error: Tensor, counts: Tensor, ratio: float) -> Tensor:
-    """[H, W] where an error is at most so many times the median of those that count."""
-    return error <= ratio * error[counts].median() if counts.any() else counts
+    """[H, W] what counts and has an error of at most so many times the median of all that count."""
+    return counts & (error <= ratio * median(error, counts))
 
 
 def expected_depth(render: Render) -> Tensor:
@@ -61,7 +59,7 @@ def mapping_loss(render: Render, view: View, config: MappingConfig) -> Tensor:
     """Mean L1 of depth over readings, and L1 with SSIM of colour over the image (paper, section 3.4)."""
     error, counts = (render.depth_acc - view.depth).abs(), view.valid
     if config.depth_outlier_ratio > 0:
-        counts = counts & inliers(error.detach(), counts, config.depth_outlier_ratio)
+        counts = inliers(error.detach(), counts, config.depth_outlier_ratio)
     depth = (error * counts).sum() / counts.sum().clamp(min=1)
     color = (1 - config.ssim_weight) * (render.rgb - view.rgb).abs().mean()
     if config.ssim_weight > 0:
@@ -93,22 +91,12 @@ def ssim_terms(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _Blur(torch.autograd.Function):
-    """Images [N, H, W] convolved with the SSIM window, zeros outside; symmetric, so it is its own adjoint.
-
-    OpenCV's separable filter takes a hundredth of the time of torch's convolution on a CPU.
-    """
+    """Images [N, H, W] convolved with the SSIM window, zeros outside; symmetric, so it is its own adjoint."""
 
     @staticmethod
     def forward(ctx: Any, images: Tensor) -> Tensor:
-        return _filtered(images.detach())
+        return blurred(images.detach())
 
     @staticmethod
     def backward(ctx: Any, slopes: Tensor) -> Tensor:
-        return _filtered(slopes)
-
-
-def _filtered(images: Tensor) -> Tensor:
-    result = torch.empty_like(images, memory_format=torch.contiguous_format)
-    for source, target in zip(images.contiguous().numpy(), result.numpy()):
-        cv2.sepFilter2D(source, -1, _WINDOW, _WINDOW, dst=target, borderType=cv2.BORDER_CONSTANT)
-    return result
+        return blurred(slopes)

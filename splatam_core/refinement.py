@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from splatam_core import se3
+from splatam_core.backend import HOST, pose_tensor
 from splatam_core.config import SlamConfig
 from splatam_core.datasets.base import Sequence, frame_or_none
 from splatam_core.errors import RunFolderError
@@ -41,7 +41,7 @@ def refine_map(
     """Fit a map to the frames of a run.
 
     Args:
-        gaussians: the map; stays as it is.
+        gaussians: the map, on the rasterizer's device; stays as it is.
         sequence: where the frames are; each is read when its turn comes, so that memory does not grow.
         poses: T_world_cam of the frames to fit, by stamp.
         rasterizer: draws the map.
@@ -52,14 +52,14 @@ def refine_map(
     Raises:
         RunFolderError: none of the poses is that of a frame.
     """
-    gaussian_map = GaussianMap(gaussians.rotations is not None)
+    gaussian_map = GaussianMap(gaussians.rotations is not None, gaussians.means.device)
     gaussian_map.append(gaussians.detached())
     views = _endless(sequence, poses, config)
     first = next(views)
     scene_radius = float(first.view.depth.max()) / config.mapping.scene_radius_ratio
     gaussian_map.start_optimization(rates(config.mapping))
     for step in progress(range(iterations)):
-        posed, weights = next(views), config.mapping
+        posed, weights = next(views).to(gaussians.means.device), config.mapping
         gaussian_map.set_rates(_faded(rates(weights), LAST_RATE ** (step / iterations)))
         render = rasterizer.render(gaussian_map.gaussians, posed.view.camera, posed.T_cam_world)
         mapping_loss(render, posed.view, weights).backward()
@@ -83,7 +83,7 @@ def _endless(sequence: Sequence, poses: Mapping[int, NDArray[np.float64]], confi
             frame = frame_or_none(sequence, int(index))
             if frame is not None and frame.stamp_ns in poses:
                 usable.append(index)
-                T_cam_world = torch.from_numpy(se3.inverse(poses[frame.stamp_ns])).float()
+                T_cam_world = pose_tensor(se3.inverse(poses[frame.stamp_ns]), HOST)
                 yield PosedView(View.from_frame(frame, config.depth), T_cam_world)
         indices = np.sort(np.array(usable, dtype=np.intp))  # the others need not be read again
     raise RunFolderError(f'none of the {len(poses)} frames to refine with is in {sequence.name}')

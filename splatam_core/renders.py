@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from splatam_core import se3
+from splatam_core.backend import pose_tensor
 from splatam_core.camera import PinholeCamera
 from splatam_core.errors import RasterizerError
 from splatam_core.rasterizer import Gaussians, Rasterizer
@@ -47,7 +48,7 @@ def render_along(
         color.mp4 depth.mp4 silhouette.mp4  depth from near (yellow) to far (blue), black = none
 
     Args:
-        gaussians: the map.
+        gaussians: the map, on the rasterizer's device.
         rasterizer: draws it.
         camera: what it is seen through.
         path: from where, in the map's world.
@@ -66,7 +67,7 @@ def render_along(
         for kind in KINDS if images else ():
             (folder / kind).mkdir()
         for index in progress(range(len(path))):
-            T_cam_world = torch.from_numpy(se3.inverse(path.T_world_cam[index])).float()
+            T_cam_world = pose_tensor(se3.inverse(path.T_world_cam[index]), map_only.means.device)
             with torch.no_grad():
                 view = rasterizer.render(map_only, camera, T_cam_world).images()
             far_m = far_m or float(view.depth_m.max()) or None

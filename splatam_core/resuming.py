@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatam_core import environment
 from splatam_core.checkpoints import Checkpoint, Checkpoints, Progress, read_newest
-from splatam_core.config import SlamConfig, flat_values
+from splatam_core.config import WHERE, SlamConfig, computed_on, flat_values
 from splatam_core.errors import CheckpointError
 from splatam_core.offline import prepare
 from splatam_core.run_folder import CHECKPOINTS, RunFolder, RunSettings, read_run, read_settings, trim_run
@@ -90,7 +90,7 @@ class ResumedRun:
 
 def resume(
     path: Path, open_source: Callable[[Source], FrameSequence], begin: Callable[[SlamConfig], None],
-    say: Callable[[str], None],
+    say: Callable[[str], None], device: str | None = None,
 ) -> ResumedRun:  # fmt: skip
     """Make ready to go on with a run.
 
@@ -99,11 +99,13 @@ def resume(
         open_source: opens a recording.
         begin: told the settings before anything is computed.
         say: tells the user.
+        device: where to go on; None = as the run's settings say.
 
     Raises:
         SplatamError: it cannot go on to the same result; nothing is changed then.
     """
     settings = read_settings(path)
+    settings = replace(settings, config=computed_on(settings.config, device))
     if settings.description.source is None:
         raise CheckpointError(f"{path}: its frames came from live topics; only runs of 'splatam run' can be resumed")
     checkpoint = read_newest(path / CHECKPOINTS)
@@ -116,7 +118,7 @@ def resume(
         say(f'{path} was begun by commit {settings.commit} and goes on by {commit}: the result may differ from either')
     trim_run(path, checkpoint.progress.num_lines, checkpoint.state.last_stamp_ns)
     folder = RunFolder(path, read_run(path).frames)
-    folder.note_resumption()
+    folder.note_resumption(settings.config)
     return ResumedRun(folder, settings, slam, sequence, checkpoint.progress.last_index + 1)
 
 
@@ -130,7 +132,7 @@ def frame_digest(frame: RgbdFrame) -> str:
 
 def _check_settings(settings: RunSettings, checkpoint: Checkpoint) -> None:
     now, before = flat_values(settings.config), flat_values(checkpoint.state.config)
-    if differing := [name for name in now if now[name] != before[name]]:
+    if differing := [name for name in now if now[name] != before[name] and name not in WHERE]:
         listed = ', '.join(f'{name} = {now[name]} (was {before[name]})' for name in differing[:3])
         raise CheckpointError(
             f'{settings.path / "config.yaml"} is not what {checkpoint.path.name} was made with: {listed}; '

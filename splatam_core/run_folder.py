@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core import environment
+from splatam_core.backend import choose_backend
 from splatam_core.camera import PinholeCamera
 from splatam_core.config import SlamConfig, load_config, to_yaml
 from splatam_core.errors import RunFolderError, SplatamError
@@ -166,13 +167,15 @@ class RunFolder:
 
         Raises:
             RunFolderError: something is there already, or it cannot be written.
+            ConfigError: the configuration asks for a device that is not there.
         """
+        backend = str(choose_backend(config))
         try:
             if path.is_dir() and any(path.iterdir()) and overwrite:
                 _remove_run(path)
             check_is_free(path)
             path.mkdir(parents=True, exist_ok=True)
-            return cls._begin(path, config, _run_information(description))
+            return cls._begin(path, config, _run_information(description) | {'backend': backend})
         except OSError as error:
             raise RunFolderError(f'{path}: cannot be written: {error.strerror}; choose another folder') from None
 
@@ -258,10 +261,13 @@ class RunFolder:
             file.flush()
             os.fsync(file.fileno())
 
-    def note_resumption(self) -> None:
-        """Write into ``run.json`` that the run goes on after it was broken off, with which code."""
+    def note_resumption(self, config: SlamConfig) -> None:
+        """Write into ``run.json`` that the run goes on after it was broken off, with which code, and where it is computed."""
         information = json.loads((self.path / RUN).read_text())
-        resumption = {'after_frames': self.num_frames, 'started': _now(), 'commit': environment.commit()}
+        resumption = {
+            'after_frames': self.num_frames, 'started': _now(), 'commit': environment.commit(),
+            'backend': str(choose_backend(config)),
+        }  # fmt: skip
         information['resumed'] = [*information.get('resumed', []), resumption]
         replace_text(self.path / RUN, _to_json(information))
 
@@ -313,6 +319,7 @@ def run_metrics(records: Sequence[FrameRecord], num_gaussians: int | None, peak_
         num_gaussians=num_gaussians,
         peak_rss_mb=peak_rss_mb,
         timings_ms=stage_statistics([record.timings for record in records]),
+        peak_gpu_mb=environment.peak_gpu_mb(),
     )
 
 
@@ -338,7 +345,7 @@ class RunRecord:
     description: RunDescription
     camera: PinholeCamera | None
     commit: str | None
-    machine: Mapping[str, str | int]
+    machine: Mapping[str, str | int | None]
     versions: Mapping[str, str | None]
     trajectory: Trajectory
     lost_ns: tuple[int, ...]
@@ -439,7 +446,7 @@ class RunSettings:
     description: RunDescription
     camera: PinholeCamera | None
     commit: str | None
-    machine: Mapping[str, str | int]
+    machine: Mapping[str, str | int | None]
     versions: Mapping[str, str | None]
 
 

@@ -10,13 +10,14 @@ import torch
 from numpy.typing import NDArray
 
 from splatam_core import se3
+from splatam_core.backend import choose_backend, finish, pose_tensor
 from splatam_core.camera import PinholeCamera
 from splatam_core.checkpoints import SlamState
 from splatam_core.config import SlamConfig
 from splatam_core.densification import densify
 from splatam_core.errors import ConfigError, FrameError, SplatamError
 from splatam_core.gaussian_map import GaussianMap
-from splatam_core.keyframes import PosedView, is_due, select_window
+from splatam_core.keyframes import KeyframeStore, PosedView, is_due, select_window
 from splatam_core.mapping import refine
 from splatam_core.motion import MotionModel, MotionPrior
 from splatam_core.rasterizer import Gaussians, make_rasterizer
@@ -28,7 +29,14 @@ Matrix = NDArray[np.float64]
 
 
 class Slam:
-    """The algorithm, synchronous and without threads of its own."""
+    """The algorithm, synchronous and without threads of its own.
+
+    Attributes:
+        config: all settings.
+        backend: where it is computed.
+        map: the Gaussians, there.
+        camera: of the frames; None before the first.
+    """
 
     def __init__(
         self, config: SlamConfig, motion_prior: MotionPrior | None = None, *,
@@ -43,20 +51,21 @@ class Slam:
             num_frames: how many frames will come, where that is known.
 
         Raises:
-            ConfigError: the true poses are asked for, and are not there.
+            ConfigError: the true poses are asked for, or a device or rasterizer, and are not there.
         """
         check_truth(config, true_motion)
         self.config = config
+        self.backend = choose_backend(config)
         self._motion_prior, self._true_motion, self._all_frames = motion_prior, true_motion, num_frames
-        self._rasterizer = make_rasterizer(config.rasterizer, config.threads)
-        self._tracker = make_tracker(self._rasterizer, config.tracking, config.threads)
+        self._rasterizer = make_rasterizer(self.backend.rasterizer, config.threads)
+        self._tracker = make_tracker(self._rasterizer, config.tracking, config.threads, self.backend.device)
         self.reset()
 
     def reset(self) -> None:
         """Forget map, poses and camera; the next frame starts a new world."""
-        self.map = GaussianMap(self.config.mapping.anisotropic)
+        self.map = GaussianMap(self.config.mapping.anisotropic, self.backend.device)
         self.camera: PinholeCamera | None = None
-        self._keyframes: list[PosedView] = []
+        self._keyframes = KeyframeStore(self.backend.device, self.config.keyframes.on_device)
         self._motion = self._motion_model()
         self._rng = np.random.default_rng(self.config.seed)
         self._scene_radius = 0.0
@@ -75,11 +84,12 @@ class Slam:
             FrameError: the frame is of another camera than the first, or not later than the last.
         """
         self._check(frame)
-        clock = _Stopwatch()
+        clock = _Stopwatch(self.backend.device)
         index, self._num_frames, self._last_stamp_ns = self._num_frames, self._num_frames + 1, frame.stamp_ns
-        view = View.from_frame(frame, self.config.depth)
+        kept = View.from_frame(frame, self.config.depth)
+        view = kept.to(self.backend.device)
         if self.num_gaussians == 0:
-            return self._initialize(index, frame, view, clock)
+            return self._initialize(index, frame, kept, view, clock)
 
         guess = se3.inverse(self._motion.predict(frame.stamp_ns))
         before = se3.inverse(self._motion.last_pose)
@@ -94,19 +104,20 @@ class Slam:
         T_world_cam = se3.inverse(tracking.T_cam_world)
         # Depth sets the pace: a colour frame that comes late, or twice, says little about how the camera moves.
         self._motion.observe(frame.stamp_ns, se3.inverse(tracking.T_cam_world_depth))
-        is_keyframe = self._map(index, _posed(view, tracking.T_cam_world), tracking.sure_fraction, clock)
+        is_keyframe = self._map(index, kept, _posed(view, tracking.T_cam_world), tracking.sure_fraction, clock)
         return self._result(index, frame, Status.TRACKED, T_world_cam, is_keyframe, clock, '',
                             tracking.sure_fraction, tracking.inlier_fraction)  # fmt: skip
 
     def configure(self, config: SlamConfig) -> None:
-        """Use other settings from the next frame on; seed, threads, rasterizer and motion model stay as they are.
+        """Use other settings from the next frame on; seed, threads, device, rasterizer and motion model stay as they are.
 
         Raises:
             ConfigError: the true poses are asked for, and are not there.
         """
         check_truth(config, self._true_motion)
         self.config = config
-        self._tracker = make_tracker(self._rasterizer, config.tracking, config.threads)
+        self._keyframes.limit = config.keyframes.on_device
+        self._tracker = make_tracker(self._rasterizer, config.tracking, config.threads, self.backend.device)
 
     def load(self, gaussians: Gaussians, T_world_cam: Matrix) -> None:
         """Go on in a map made earlier.
@@ -141,7 +152,9 @@ class Slam:
         self.map.restore(state.map)
         self._motion.restore(state.motion)
         self._rng.bit_generator.state = state.rng
-        self.camera, self._keyframes, self._scene_radius = state.camera, list(state.keyframes), state.scene_radius
+        for keyframe in state.keyframes:
+            self._keyframes.append(keyframe)
+        self.camera, self._scene_radius = state.camera, state.scene_radius
         self._num_frames, self._last_stamp_ns = state.num_frames, state.last_stamp_ns
 
     def rest(self) -> None:
@@ -157,7 +170,7 @@ class Slam:
         """
         if self.camera is None:
             raise SplatamError('nothing can be rendered before the first frame: the camera is not known')
-        T_cam_world = torch.from_numpy(se3.inverse(T_world_cam)).float()
+        T_cam_world = pose_tensor(se3.inverse(T_world_cam), self.backend.device)
         with torch.no_grad():
             return self._rasterizer.render(self.map.gaussians.detached(), self.camera, T_cam_world).images()
 
@@ -175,12 +188,12 @@ class Slam:
             )
         self.camera = frame.camera
 
-    def _initialize(self, index: int, frame: RgbdFrame, view: View, clock: _Stopwatch) -> FrameResult:
+    def _initialize(self, index: int, frame: RgbdFrame, kept: View, view: View, clock: _Stopwatch) -> FrameResult:
         if reason := self._why_not_to_start(index, view):
             reason = f'the map cannot start: {reason}'
             return self._result(index, frame, Status.LOST, None, False, clock, reason, 0.0, 0.0)
         self._motion.observe(frame.stamp_ns, np.eye(4))
-        self._map(0, _posed(view, np.eye(4)), 0.0, clock)
+        self._map(0, kept, _posed(view, np.eye(4)), 0.0, clock)
         return self._result(index, frame, Status.INITIALIZED, np.eye(4), True, clock, '', 1.0, 1.0)
 
     def _why_not_to_start(self, index: int, view: View) -> str:
@@ -190,8 +203,8 @@ class Slam:
             return 'this frame is held out of it (mapping.hold_out)'
         return '' if view.valid.any() else 'no pixel has a usable depth reading'
 
-    def _map(self, index: int, current: PosedView, sure_fraction: float, clock: _Stopwatch) -> bool:
-        """Densify, choose a window, refine; keep the view if it is due. Whether it was."""
+    def _map(self, index: int, kept: View, current: PosedView, sure_fraction: float, clock: _Stopwatch) -> bool:
+        """Densify, choose a window, refine; keep the host's view if it is due. Whether it was."""
         config = self.config
         if not config.mapping.enabled or config.mapping.is_held_out(index):
             return False
@@ -204,14 +217,15 @@ class Slam:
                     densify(self.map.gaussians, current.view, current.T_cam_world, self._rasterizer, config.densification)
                 )
                 clock.lap('densify')
-            window = select_window(current, self._keyframes, config.keyframes, self._rng)
+            window = self._keyframes.window(select_window(current, self._keyframes, config.keyframes, self._rng))
             clock.lap('keyframes')
             more = config.mapping.first_iterations if index == 0 else 0
             refine(self.map, window, self._rasterizer, config, self._scene_radius, self._rng, more)
             clock.lap('map')
         is_keyframe = is_due(index, config.keyframes, self._all_frames)
         if is_keyframe:
-            self._keyframes.append(replace(current, view=replace(current.view)))  # leaves behind what the view has cached
+            T_cam_world = current.T_cam_world.to(kept.depth.device)
+            self._keyframes.append(PosedView(replace(kept), T_cam_world), current)  # without what the view has cached
         return is_keyframe
 
     def _motion_model(self) -> MotionModel:
@@ -243,19 +257,22 @@ def check_truth(config: SlamConfig, true_motion: MotionPrior | None) -> None:
 
 
 def _posed(view: View, T_cam_world: Matrix) -> PosedView:
-    return PosedView(view, torch.from_numpy(T_cam_world).float())
+    return PosedView(view, pose_tensor(T_cam_world, view.depth.device))
 
 
 @dataclass(slots=True)
 class _Stopwatch:
+    device: torch.device
     started: float = field(default_factory=time.perf_counter)
     lapped: float = field(default_factory=time.perf_counter)
     laps: dict[str, float] = field(default_factory=dict)
 
     def lap(self, stage: str) -> None:
+        finish(self.device)
         now = time.perf_counter()
         self.laps[stage] = 1e3 * (now - self.lapped)
         self.lapped = now
 
     def timings(self) -> StageTimings:
+        finish(self.device)
         return StageTimings(**self.laps, total=1e3 * (time.perf_counter() - self.started))

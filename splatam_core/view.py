@@ -13,6 +13,7 @@ from torch import Tensor
 
 from splatam_core.camera import PinholeCamera, kept
 from splatam_core.config import DepthConfig
+from splatam_core.filters import nearest, shrunk
 from splatam_core.types import RgbdFrame
 
 
@@ -32,9 +33,15 @@ class View:
 
     @classmethod
     def from_frame(cls, frame: RgbdFrame, config: DepthConfig) -> View:
-        """The frame's images, with only the depth readings that count."""
+        """The frame's images in the host's memory, with only the depth readings that count."""
         depth_m = usable_depth(frame.depth_m, config)
         return cls(frame.camera, torch.from_numpy(np.ascontiguousarray(frame.rgb)), torch.from_numpy(depth_m))
+
+    def to(self, device: torch.device) -> View:
+        """The same on a device; itself where it is there already."""
+        if self.depth.device == device:
+            return self
+        return View(self.camera, self.rgb8.to(device, non_blocking=True), self.depth.to(device, non_blocking=True))
 
     @cached_property
     def rgb(self) -> Tensor:
@@ -51,9 +58,7 @@ class View:
         if scale == 1.0:
             return self
         size = max(1, round(self.camera.width * scale)), max(1, round(self.camera.height * scale))
-        rgb8 = cv2.resize(self.rgb8.numpy(), size, interpolation=cv2.INTER_AREA)
-        depth = cv2.resize(self.depth.numpy(), size, interpolation=cv2.INTER_NEAREST_EXACT)
-        return View(self.camera.resized(*size), torch.from_numpy(rgb8), torch.from_numpy(depth))
+        return View(self.camera.resized(*size), shrunk(self.rgb8, *size), nearest(self.depth, *size))
 
     def points(self, chosen: Tensor) -> Tensor:
         """[K, 3] camera coordinates of the pixels where ``chosen`` [H, W] is true, row by row."""

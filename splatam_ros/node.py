@@ -63,8 +63,10 @@ class SplatamNode(Node):
         self._geometry = Geometry(self, self.options, self._warnings, lambda: self._intake.camera_frame)
         self._outputs = Outputs(self, self.options, self._geometry)
         self._intake = Intake(self.options, self._warnings, self._gate, self._outputs.done)
-        self._session = Session(self.options, config, self.get_logger(), self._outputs)
         self._slam = Slam(config, self._geometry.prior)
+        if self._slam.backend.why:
+            self.get_logger().info(str(self._slam.backend))
+        self._session = Session(self.options, config, self.get_logger(), self._outputs)
         if self.options.load_path:
             self._session.load(self._slam)
         self._inputs = self._subscribe()

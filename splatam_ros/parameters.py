@@ -156,6 +156,7 @@ FIXED = {
     'max_path_poses': 'the path so far is thinned out by it',
     'slam.seed': 'it is where the random choices of this map started',
     'slam.threads': 'the threads are running',
+    'slam.device': 'the map is there',
     'slam.rasterizer': 'it is made when the node starts',
     'slam.tracking.motion_model': 'it is made when the map starts',
     'slam.mapping.anisotropic': 'the map is made of the one kind or of the other',

@@ -46,7 +46,7 @@ def evaluate(args: argparse.Namespace) -> int:
     """Score a run and draw its report."""
     from splatam_core.run_folder import MAP
 
-    run = open_run(args.dir)
+    run = open_run(args.dir, args.device)
     truth, sequence = _truth_and_frames(run, args.truth)
     if sequence is not None and not (run.path / MAP).is_file():
         say(f'{run.path} has no {MAP}, the run ended before it was saved: trajectory only')

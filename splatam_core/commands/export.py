@@ -64,7 +64,7 @@ def export(args: argparse.Namespace) -> int:
         raise ExportError(f"{args.file}: '{args.file.suffix}' files are not written; name it .ply")
     if args.file.exists() and not args.overwrite:
         raise ExportError(f'{args.file} exists: choose another name, or replace it with --overwrite')
-    run = open_run(args.dir)
+    run = open_run(args.dir, args.device)
     gaussians = run.read_map()
     try:
         if args.form == 'gaussians':
@@ -82,10 +82,11 @@ def export(args: argparse.Namespace) -> int:
 
 def _mesh(args: argparse.Namespace, run: RunRecord, gaussians: Gaussians) -> Surface:
     from splatam_core.export import fused_mesh
-    from splatam_core.rasterizer import make_rasterizer
+    from splatam_core.rasterizer import rasterizer_for
 
+    rasterizer, device = rasterizer_for(run.config)
     return fused_mesh(
-        gaussians, make_rasterizer(run.config.rasterizer, run.config.threads), run.camera_or_error(),
+        gaussians.to(device), rasterizer, run.camera_or_error(),
         run.trajectory.T_world_cam[:: args.every], args.voxel, args.max_depth, progress('fusing', 'view'),
     )  # fmt: skip
 

@@ -23,23 +23,24 @@ def refine(args: argparse.Namespace) -> int:
     """Optimise a finished map over all frames of its run."""
     from splatam_core.evaluation.images import mean_scores
     from splatam_core.evaluation.score import score_images
-    from splatam_core.rasterizer import make_rasterizer
+    from splatam_core.rasterizer import rasterizer_for
     from splatam_core.refinement import refine_map
-    from splatam_core.run_folder import check_is_free, read_run, write_refined
+    from splatam_core.run_folder import check_is_free, write_refined
 
-    run = open_run(args.dir)
-    gaussians = run.read_map()
+    run = open_run(args.dir, args.device)
+    rasterizer, device = rasterizer_for(run.config)
+    gaussians = run.read_map().to(device)
     if run.description.source is None:
         raise RunFolderError(f'{args.dir} does not say where its frames came from, so they cannot be read again')
     check_is_free(args.out)
     sequence = open_source(run.description.source)
     before = mean_scores(score_images(run, sequence, args.every, progress('scoring')).frames)
     refined = refine_map(
-        gaussians, sequence, run.mapped_poses(), make_rasterizer(run.config.rasterizer, run.config.threads), run.config,
+        gaussians, sequence, run.mapped_poses(), rasterizer, run.config,
         args.iterations, progress('refining', 'step'),
     )  # fmt: skip
     write_refined(run, args.out, refined, args.iterations)
-    metrics = score_own_run(read_run(args.out), sequence, args.every)
+    metrics = score_own_run(open_run(args.out, args.device), sequence, args.every)
     print_summary(metrics, args.out)
     if before.psnr_db is not None and metrics.psnr_db is not None:
         print(f'PSNR was {before.psnr_db:.2f} dB, is {metrics.psnr_db:.2f} dB')

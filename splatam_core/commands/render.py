@@ -25,15 +25,16 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def render(args: argparse.Namespace) -> int:
     """Film a run's map along a path."""
     from splatam_core.files import new_folder
-    from splatam_core.rasterizer import make_rasterizer
+    from splatam_core.rasterizer import rasterizer_for
     from splatam_core.renders import median_rate_hz, render_along
     from splatam_core.run_folder import check_is_free
     from splatam_core.trajectory import read_trajectory
 
     if args.no_images and args.no_video:
         raise RunFolderError('--no-images and --no-video together leave nothing to write')
-    run = open_run(args.dir)
-    camera, gaussians = run.camera_or_error(), run.read_map()
+    run = open_run(args.dir, args.device)
+    camera, (rasterizer, device) = run.camera_or_error(), rasterizer_for(run.config)
+    gaussians = run.read_map().to(device)
     path = run.trajectory if args.poses is None else read_trajectory(args.poses)
     if len(path) == 0:
         raise RunFolderError(f'{args.poses or args.dir}: there is no pose to render from')
@@ -44,7 +45,7 @@ def render(args: argparse.Namespace) -> int:
     try:
         with new_folder(args.out) as folder:
             render_along(
-                gaussians, make_rasterizer(run.config.rasterizer, run.config.threads), camera, path, folder,
+                gaussians, rasterizer, camera, path, folder,
                 images=not args.no_images, rate_hz=rate_hz, progress=progress('rendering', 'view'),
             )  # fmt: skip
     except OSError as error:

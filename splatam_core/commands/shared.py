@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from splatam_core.config import DEVICES, computed_on
 
 if TYPE_CHECKING:
     from splatam_core.datasets.base import Sequence
@@ -54,6 +56,12 @@ def add_source_arguments(parser: argparse.ArgumentParser, *, optional: bool = Fa
 def add_run_argument(parser: argparse.ArgumentParser) -> None:
     """DIR, a run's folder."""
     parser.add_argument('dir', type=Path, metavar='DIR', help="folder of a run, the command line's or the node's")
+    add_device_argument(parser, "where to compute (default: as the run's settings say)")
+
+
+def add_device_argument(parser: argparse.ArgumentParser, help: str) -> None:
+    """--device."""
+    parser.add_argument('--device', choices=DEVICES, help=help)
 
 
 def source_of(args: argparse.Namespace) -> Source:
@@ -101,8 +109,12 @@ def open_source(source: Source) -> Sequence:
     )
 
 
-def open_run(path: Path) -> RunRecord:
+def open_run(path: Path, device: str | None = None) -> RunRecord:
     """Read a run's folder and keep the libraries within its threads.
+
+    Args:
+        path: the folder.
+        device: where to compute; None = as the run's settings say.
 
     Raises:
         RunFolderError: it is no run folder, or one of its files is damaged.
@@ -111,6 +123,7 @@ def open_run(path: Path) -> RunRecord:
     from splatam_core.run_folder import read_run
 
     run = read_run(path)
+    run = replace(run, config=computed_on(run.config, device))
     apply_threads(run.config)
     return run
 

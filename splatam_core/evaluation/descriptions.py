@@ -81,6 +81,7 @@ DESCRIPTIONS: dict[str, tuple[Description, ...]] = {
         Description('fps_with_io', 'speed with decoding', 'fps', 1, '.2f', 'The same, decoding included.'),
         Description('num_gaussians', 'Gaussians', '', 1, ',d', 'Size of the final map.'),
         Description('peak_rss_mb', 'peak memory', 'MiB', 1, ',.0f', 'Most memory the process held.'),
+        Description('peak_gpu_mb', 'peak memory of the GPU', 'MiB', 1, ',.0f', "Most memory the process's tensors took on a GPU."),
     ),
     'Trajectory': (
         Description('ate_rmse_m', 'ATE RMSE', 'cm', 100, '.3f', 'Root mean squared distance of the camera centres, aligned rigidly.'),

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatam_core import se3
+from splatam_core.backend import pose_tensor
 from splatam_core.config import DepthConfig
 from splatam_core.evaluation.similarity import ms_ssim
 from splatam_core.losses import ssim_map
@@ -101,7 +102,7 @@ class ViewScorer:
     """Renders a finished map at poses and compares with the frames taken there.
 
     Args:
-        gaussians: the map.
+        gaussians: the map, on the rasterizer's device; what is compared is brought there.
         rasterizer: draws it.
         depth: the range in which readings count. Its edge filter does not apply: a run that closes its eyes to
             hard pixels is scored on them all the same.
@@ -118,11 +119,11 @@ class ViewScorer:
 
     def view(self, frame: RgbdFrame) -> View:
         """The frame's images, with the depth readings that count."""
-        return View.from_frame(frame, self._depth)
+        return View.from_frame(frame, self._depth).to(self._gaussians.means.device)
 
     def render(self, frame: RgbdFrame, T_world_cam: NDArray[np.float64]) -> Render:
         """The map from a pose, in the frame's camera."""
-        T_cam_world = torch.from_numpy(se3.inverse(T_world_cam)).to(self._gaussians.means.dtype)
+        T_cam_world = pose_tensor(se3.inverse(T_world_cam), self._gaussians.means.device)
         with torch.no_grad():
             return self._rasterizer.render(self._gaussians, frame.camera, T_cam_world)
 
@@ -130,7 +131,7 @@ class ViewScorer:
         """How the map at a pose matches the frame taken there."""
         render, view = self.render(frame, T_world_cam), self.view(frame)
         scores = score_view(render.rgb, render.depth(), view.rgb, view.depth, view.valid, self._lpips)
-        original = original_scores(render, view.rgb, torch.from_numpy(frame.depth_m), self._lpips)
+        original = original_scores(render, view.rgb, torch.from_numpy(frame.depth_m).to(view.depth.device), self._lpips)
         holes = view.valid & (render.silhouette <= HOLE_SILHOUETTE)
         return FrameScores(frame.stamp_ns, scores, original, float(holes.float().mean()))
 

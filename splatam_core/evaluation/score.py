@@ -23,7 +23,7 @@ from splatam_core.evaluation.trajectory import (
     trajectory_error,
     transformed,
 )
-from splatam_core.rasterizer import make_rasterizer
+from splatam_core.rasterizer import rasterizer_for
 from splatam_core.run_folder import RunRecord
 from splatam_core.trajectory import stamp_text
 from splatam_core.types import RgbdFrame, Trajectory
@@ -288,8 +288,9 @@ def make_scorer(run: RunRecord, lpips: Lpips | str) -> ViewScorer:
         RunFolderError: the run has no map.
         MapFileError: the map cannot be read.
     """
-    rasterizer = make_rasterizer(run.config.rasterizer, run.config.threads)
-    return ViewScorer(run.read_map(), rasterizer, run.config.depth, lpips if isinstance(lpips, Lpips) else None)
+    rasterizer, device = rasterizer_for(run.config)
+    gaussians = run.read_map().to(device)
+    return ViewScorer(gaussians, rasterizer, run.config.depth, lpips if isinstance(lpips, Lpips) else None)
 
 
 def _stamps_to_score(run: RunRecord, every: int) -> tuple[set[int], set[int]]:
@@ -324,9 +325,9 @@ def _worst_to_best(scored: Mapping[int, FrameScores]) -> list[tuple[str, int]]:
 
 def _sample(title: str, scorer: ViewScorer, frame: RgbdFrame, T_world_cam: Pose, scores: FrameScores) -> Sample:
     render = scorer.render(frame, T_world_cam)
-    rgb = render.rgb.clamp(0, 1).permute(1, 2, 0).numpy()
-    reading_m = scorer.view(frame).depth.numpy()
-    return Sample(title, frame, reading_m, rgb, render.depth().numpy(), render.silhouette.numpy(), scores)
+    rgb, reading_m = render.rgb.clamp(0, 1).permute(1, 2, 0), scorer.view(frame).depth
+    images = (image.numpy(force=True) for image in (reading_m, rgb, render.depth(), render.silhouette))
+    return Sample(title, frame, *images, scores)
 
 
 def _none_found(run: RunRecord, sequence: Sequence) -> str:

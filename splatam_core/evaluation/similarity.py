@@ -41,7 +41,7 @@ def ms_ssim(a: Tensor, b: Tensor) -> float | None:
     """
     if min(a.shape[-2:]) < MIN_SIDE:
         return None
-    similarity = torch.ones(len(a))
+    similarity = torch.ones(len(a), device=a.device)
     for scale, weight in enumerate(SCALE_WEIGHTS):
         if scale:
             a, b = _halved(a), _halved(b)
@@ -76,7 +76,7 @@ class Lpips:
         if min(a.shape[-2:]) < LPIPS_MIN_SIDE:
             return None
         with torch.no_grad():
-            return float(self.network(a[None], b[None], normalize=True))
+            return float(self.network.to(a.device)(a[None], b[None], normalize=True))
 
 
 @lru_cache(maxsize=1)

@@ -2,19 +2,35 @@
 
 from __future__ import annotations
 
+import torch
+
+from splatam_core.backend import choose_backend
+from splatam_core.config import SlamConfig
 from splatam_core.rasterizer.base import Gaussians, Moments, Rasterizer, Rates, Render, Target, joined
 
-__all__ = ['Gaussians', 'Moments', 'Rasterizer', 'Rates', 'Render', 'Target', 'joined', 'make_rasterizer']
+__all__ = [
+    'Gaussians', 'Moments', 'Rasterizer', 'Rates', 'Render', 'Target', 'joined', 'make_rasterizer', 'rasterizer_for',
+]  # fmt: skip
 
 
 def make_rasterizer(name: str, threads: int = 0) -> Rasterizer:
-    """A backend by its name in the configuration.
+    """A backend by its name.
 
     Args:
-        name: ``cpu``, ``reference`` or ``triton``.
+        name: ``cpu``, ``reference`` or ``triton``; what the configuration's ``auto`` means, ``rasterizer_for`` knows.
         threads: CPU threads of ``cpu``; 0 = all cores.
     """
     return _BACKENDS[name](threads)
+
+
+def rasterizer_for(config: SlamConfig) -> tuple[Rasterizer, torch.device]:
+    """What draws maps by a configuration, and where they have to be.
+
+    Raises:
+        ConfigError: it asks for what is not there.
+    """
+    backend = choose_backend(config)
+    return make_rasterizer(backend.rasterizer, config.threads), backend.device
 
 
 def _cpu(threads: int) -> Rasterizer:

@@ -66,6 +66,11 @@ class Gaussians:
             None if self.rotations is None else self.rotations.detach(),
         )  # fmt: skip
 
+    def to(self, device: torch.device) -> Gaussians:
+        """The same on a device; themselves where they are there already."""
+        values = (self.means, self.log_scales, self.logit_opacities, self.rgb, self.bounds, self.rotations)
+        return Gaussians(*(None if value is None else value.to(device) for value in values))
+
     def anisotropic(self) -> Gaussians:
         """The same as anisotropic Gaussians: three equal radii, not turned, where they are isotropic."""
         if self.rotations is not None:
@@ -165,7 +170,7 @@ class Render:
     def images(self) -> RenderedView:
         """The same for people and for metrics: 8-bit colour, expected depth, silhouette."""
         rgb = self.rgb.clamp(0, 1).mul(255).round().byte().permute(1, 2, 0).contiguous()
-        return RenderedView(rgb.numpy(), self.depth().numpy(), self.silhouette.numpy())
+        return RenderedView(*(image.numpy(force=True) for image in (rgb, self.depth(), self.silhouette)))
 
 
 class Rasterizer(Protocol):

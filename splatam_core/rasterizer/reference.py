@@ -36,11 +36,11 @@ class ReferenceRasterizer:
         ellipses = on_image(gaussians, camera, T_cam_world)
         z = ellipses.features[:, 3:]
         features = torch.cat([ellipses.features, torch.ones_like(z)], dim=1)  # [K, 5]
-        columns = torch.arange(camera.width, dtype=z.dtype)
+        columns = torch.arange(camera.width, dtype=z.dtype, device=z.device)
         rows_at_once = max(1, _MAX_CELLS // max(1, len(z) * camera.width))
         bands = [
             _blend(ellipses, features, columns, rows.to(z.dtype))
-            for rows in torch.arange(camera.height).split(rows_at_once)
+            for rows in torch.arange(camera.height, device=z.device).split(rows_at_once)
         ]
         image = torch.cat(bands, dim=1)  # [5, H, W]
         return Render(image[:3], image[3], image[4])
@@ -60,7 +60,7 @@ class ReferenceRasterizer:
         first, second = moments.first_second[seen].to(gradient.dtype).split(8, dim=1)
         first, second = BETA_1 * first + (1 - BETA_1) * gradient, BETA_2 * second + (1 - BETA_2) * gradient**2
         moments.first_second[seen] = torch.cat([first, second], dim=1).to(moments.first_second.dtype)
-        rate = torch.tensor([rates.means] * 3 + [rates.log_scales, rates.logit_opacities] + [rates.rgb] * 3)
+        rate = torch.tensor([rates.means] * 3 + [rates.log_scales, rates.logit_opacities] + [rates.rgb] * 3).to(step.device)
         move = rate * (first / (1 - BETA_1**step)) / ((second / (1 - BETA_2**step)).sqrt() + EPSILON)
         for value, moved in zip(values, move.split([3, 1, 1, 3], dim=1), strict=True):
             value[seen] -= moved.to(value.dtype)

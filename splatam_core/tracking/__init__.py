@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import torch
+
+from splatam_core.backend import HOST
 from splatam_core.config import TrackingConfig
 from splatam_core.rasterizer import Rasterizer
 from splatam_core.tracking.align import AlignmentTracker
 from splatam_core.tracking.base import Tracker, TrackingResult
 from splatam_core.tracking.none import NullTracker
 from splatam_core.tracking.render_and_compare import RenderAndCompareTracker
+from splatam_core.tracking.torch_aligner import TorchAligner
 
-__all__ = ['AlignmentTracker', 'NullTracker', 'RenderAndCompareTracker', 'Tracker', 'TrackingResult', 'make_tracker']
+__all__ = [
+    'AlignmentTracker', 'NullTracker', 'RenderAndCompareTracker', 'TorchAligner', 'Tracker', 'TrackingResult', 'make_tracker',
+]  # fmt: skip
 
 _TRACKERS = {
     'render_and_compare': RenderAndCompareTracker, 'align': AlignmentTracker,
@@ -17,6 +23,15 @@ _TRACKERS = {
 }  # fmt: skip
 
 
-def make_tracker(rasterizer: Rasterizer, config: TrackingConfig, threads: int = 0) -> Tracker:
-    """The tracker that the configuration names."""
-    return _TRACKERS[config.method](rasterizer, config, threads)
+def make_tracker(
+    rasterizer: Rasterizer, config: TrackingConfig, threads: int = 0, device: torch.device = HOST
+) -> Tracker:
+    """The tracker that the configuration names.
+
+    Args:
+        rasterizer: draws the map.
+        config: what to do.
+        threads: CPU threads; 0 = all cores.
+        device: where map and frames are.
+    """
+    return _TRACKERS[config.method](rasterizer, config, threads, device)

@@ -15,20 +15,26 @@ import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import Union
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from splatam_core import _native, se3
+from splatam_core.backend import pose_tensor
 from splatam_core.camera import PinholeCamera
 from splatam_core.config import TrackingConfig
+from splatam_core.filters import brightness, is_on_host, luminance
 from splatam_core.rasterizer import Gaussians, Rasterizer, Render
 from splatam_core.tracking.base import TrackingResult, failure
+from splatam_core.tracking.torch_aligner import TorchAligner
 from splatam_core.view import View
 
 Array = NDArray[np.float32]
+Image = Union[Array, Tensor]  # on the host; elsewhere
 Matrix = NDArray[np.float64]
 
 _COARSEST_PX = 32  # smaller images show too little to align
@@ -45,22 +51,22 @@ _PRIOR = np.array([0.3] * 6 + [0.1] * 2 + [0.5]) ** -2  # spread of a step (m, r
 class AlignmentTracker:
     """Keeps the aligned pose where it explains the frame better than the first guess."""
 
-    def __init__(self, rasterizer: Rasterizer, config: TrackingConfig, threads: int) -> None:
+    def __init__(self, rasterizer: Rasterizer, config: TrackingConfig, threads: int, device: torch.device) -> None:
         self._rasterizer = rasterizer
         self._config = config
-        self._aligner = _native.Aligner(threads or len(os.sched_getaffinity(0)))
+        is_native = device.type == 'cpu'
+        self._aligner = _native.Aligner(threads or len(os.sched_getaffinity(0))) if is_native else TorchAligner()
 
     def track(
         self, view: View, gaussians: Gaussians, T_cam_world: Matrix, T_cam_world_before: Matrix | None = None
     ) -> TrackingResult:
         """See ``Tracker.track``."""
-        depth = np.where(view.valid, view.depth, np.float32(np.nan))
-        frames = self._levels(_Picture(view.camera, _brightness(view.rgb8.numpy().astype(np.float32) / 255), depth))
+        frames = self._levels(_frame(view))
         references = self._references(gaussians, view.camera, frames[0].camera, T_cam_world)
         before = None if T_cam_world_before is None else T_cam_world @ se3.inverse(T_cam_world_before)
         alignment = self._align(references, frames, before)
         fit = alignment.fit
-        readings = int(np.isfinite(frames[0].depth).sum())
+        readings = int((frames[0].depth > 0).sum())
         sure_fraction, inlier_fraction = fit.compared / max(1, readings), fit.agreeing / max(1, fit.compared)
         at_color, at_depth = alignment.state.light_motion @ T_cam_world, alignment.state.motion @ T_cam_world
         reason = failure(at_color, readings, sure_fraction, inlier_fraction, self._config)
@@ -72,7 +78,7 @@ class AlignmentTracker:
         """The map from the first guess, at the resolutions of ``_levels``."""
         camera = finest if self._config.half_render else full
         with torch.no_grad():
-            render = self._rasterizer.render(gaussians, camera, torch.from_numpy(T_cam_world).float())
+            render = self._rasterizer.render(gaussians, camera, pose_tensor(T_cam_world, gaussians.means.device))
         picture = _reference(camera, render, self._config.silhouette_threshold)
         if camera == full:
             return self._levels(picture)
@@ -82,7 +88,8 @@ class AlignmentTracker:
     def _without_edges(self, picture: _Picture) -> _Picture:
         """What a render blends across an edge is no surface; ``halve`` leaves it out on the way to the other levels."""
         layers = self._aligner.layers(picture.brightness, picture.depth, _EDGE)
-        return replace(picture, depth=np.ascontiguousarray(layers[..., _DEPTH_LAYER]))
+        depth = layers[..., _DEPTH_LAYER]
+        return replace(picture, depth=depth if isinstance(depth, Tensor) else np.ascontiguousarray(depth))
 
     def _levels(self, picture: _Picture) -> list[_Picture]:
         """The picture at a half, a quarter, ...; itself where it is too small for that.
@@ -125,7 +132,7 @@ class AlignmentTracker:
     def _free_unknowns(self) -> list[int]:
         return [*range(6), *[6, 7] * self._config.exposure, *[8] * self._config.lag]
 
-    def _fit(self, reference: _Picture, layers: Array, state: _State, scales: tuple[float, float]) -> _Fit:
+    def _fit(self, reference: _Picture, layers: Image, state: _State, scales: tuple[float, float]) -> _Fit:
         camera, config = reference.camera, self._config
         weights = config.color_weight, config.depth_weight
         weighted = (scale / math.sqrt(max(weight, _LEAST_WEIGHT)) for scale, weight in zip(scales, weights, strict=True))
@@ -149,8 +156,8 @@ class _Picture:
     """
 
     camera: PinholeCamera
-    brightness: Array
-    depth: Array
+    brightness: Image
+    depth: Image
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -248,7 +255,17 @@ class _Alignment:
     fit: _Fit
 
 
+def _frame(view: View) -> _Picture:
+    if not is_on_host(view.depth):
+        return _Picture(view.camera, brightness(view.rgb8), torch.where(view.valid, view.depth, torch.nan))
+    depth = np.where(view.valid, view.depth, np.float32(np.nan))
+    return _Picture(view.camera, _brightness(view.rgb8.numpy().astype(np.float32) / 255), depth)
+
+
 def _reference(camera: PinholeCamera, render: Render, silhouette_threshold: float) -> _Picture:
+    if not is_on_host(render.rgb):
+        depth = torch.where(render.silhouette > silhouette_threshold, render.depth(), torch.nan)
+        return _Picture(camera, luminance(render.rgb.permute(1, 2, 0)), depth)
     sure = (render.silhouette > silhouette_threshold).numpy()
     depth = np.where(sure, render.depth().numpy(), np.float32(np.nan))
     return _Picture(camera, _brightness(np.ascontiguousarray(render.rgb.permute(1, 2, 0).numpy())), depth)

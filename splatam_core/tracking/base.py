@@ -6,10 +6,13 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from splatam_core.config import TrackingConfig
-from splatam_core.losses import TrackingLoss, tracking_loss
+from splatam_core.filters import is_on_host
+from splatam_core.losses import TrackingLoss
 from splatam_core.rasterizer import Gaussians, Render
 from splatam_core.view import View
 
@@ -54,45 +57,53 @@ class Tracker(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """A pose a tracker considers.
+    """A pose a tracker considers; all of it is where the map is, so that a GPU need not be waited for.
 
     The loss alone cannot say which pose is best: one that sees less of the map sums over fewer pixels. So a pixel with
     a reading that sees no sure map is taken to be as wrong as the average pixel was at the first guess.
 
     Attributes:
-        T_cam_world: [4, 4] float64.
+        pose: [4, 4] T_cam_world, float32, without gradients.
         render: the map from there, without gradients.
-        cost: the lower, the better it explains the view.
-        mean_error: average loss of the pixels that counted, at the first guess.
+        cost: [] float64; the lower, the better it explains the view.
+        mean_error: [] float64, average loss of the pixels that counted, at the first guess.
     """
 
-    T_cam_world: NDArray[np.float64]
+    pose: Tensor
     render: Render
-    cost: float
-    mean_error: float
+    cost: Tensor
+    mean_error: Tensor
 
     @classmethod
-    def of(
-        cls, T_cam_world: NDArray[np.float64], render: Render, view: View, config: TrackingConfig,
-        guess: Candidate | None, loss: TrackingLoss | None = None,
-    ) -> Candidate:  # fmt: skip
+    def of(cls, pose: Tensor, render: Render, view: View, guess: Candidate | None, loss: TrackingLoss) -> Candidate:
         """Weigh a pose against the first guess, or the first guess itself where there is none yet."""
-        if loss is None:
-            loss = tracking_loss(render, view, config)
-        total, readings = loss.total.item(), int(view.valid.sum())
-        mean_error = guess.mean_error if guess else total / max(1, loss.num_pixels)
-        return cls(T_cam_world, render, total + mean_error * (readings - loss.num_pixels), mean_error)
+        total, readings = loss.total.detach().double(), view.valid.sum()
+        mean_error = guess.mean_error if guess else total / loss.num_pixels.clamp(min=1)
+        drawn = Render(render.rgb.detach(), render.depth_acc.detach(), render.silhouette.detach())
+        return cls(pose.detach(), drawn, total + mean_error * (readings - loss.num_pixels), mean_error)
+
+    def or_better(self, other: Candidate) -> Candidate:
+        """The one of lower cost, this one where they are equal."""
+        better = other.cost < self.cost
+        if is_on_host(better):
+            return other if better else self
+        a, b = self.render, other.render
+        render = Render(
+            torch.where(better, b.rgb, a.rgb), torch.where(better, b.depth_acc, a.depth_acc),
+            torch.where(better, b.silhouette, a.silhouette),
+        )  # fmt: skip
+        pose, cost = torch.where(better, other.pose, self.pose), torch.where(better, other.cost, self.cost)
+        return Candidate(pose, render, cost, self.mean_error)
 
 
 def judge(T_cam_world: NDArray[np.float64], render: Render, view: View, config: TrackingConfig) -> TrackingResult:
     """Hold the map, rendered at a pose, against the view: is this where the camera is?"""
-    readings = int(view.valid.sum())
     sure = view.valid & (render.silhouette > config.silhouette_threshold)
     depth_agrees = (render.depth() - view.depth).abs() <= config.inlier_depth * view.depth
     color_agrees = (render.rgb - view.rgb).abs().mean(dim=0) <= config.inlier_color
-    num_sure = int(sure.sum())
-    sure_fraction = num_sure / max(1, readings)
-    inlier_fraction = int((sure & depth_agrees & color_agrees).sum()) / max(1, num_sure)
+    counts = torch.stack([view.valid.sum(), sure.sum(), (sure & depth_agrees & color_agrees).sum()])
+    readings, num_sure, num_inliers = counts.tolist()
+    sure_fraction, inlier_fraction = num_sure / max(1, readings), num_inliers / max(1, num_sure)
     reason = failure(T_cam_world, readings, sure_fraction, inlier_fraction, config)
     return TrackingResult(T_cam_world, T_cam_world, sure_fraction, inlier_fraction, reason)
 

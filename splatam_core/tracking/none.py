@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import torch
+
 from splatam_core.config import TrackingConfig
 from splatam_core.rasterizer import Gaussians, Rasterizer
 from splatam_core.tracking.base import Matrix, TrackingResult
@@ -14,7 +16,7 @@ class NullTracker:
     For measuring what is around the core, and for mapping along poses that come from elsewhere.
     """
 
-    def __init__(self, rasterizer: Rasterizer, config: TrackingConfig, threads: int = 0) -> None:
+    def __init__(self, rasterizer: Rasterizer, config: TrackingConfig, threads: int, device: torch.device) -> None:
         pass
 
     def track(

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from splatam_core import se3
 from splatam_core.config import TrackingConfig
+from splatam_core.filters import is_on_host
 from splatam_core.losses import TrackingLoss, tracking_loss
 from splatam_core.rasterizer import Gaussians, Rasterizer
 from splatam_core.tracking.base import Candidate, Matrix, TrackingResult, judge
@@ -20,7 +21,7 @@ from splatam_core.view import View
 class RenderAndCompareTracker:
     """Keeps the best pose of all it evaluated, the first guess included."""
 
-    def __init__(self, rasterizer: Rasterizer, config: TrackingConfig, threads: int = 0) -> None:
+    def __init__(self, rasterizer: Rasterizer, config: TrackingConfig, threads: int, device: torch.device) -> None:
         self._rasterizer = rasterizer
         self._config = config
 
@@ -29,13 +30,15 @@ class RenderAndCompareTracker:
     ) -> TrackingResult:
         """See ``Tracker.track``."""
         config, gaussians = self._config, gaussians.detached()
-        rotation = torch.tensor(se3.quaternion_from_rotation(T_cam_world[:3, :3]), dtype=torch.float32)
-        translation = torch.tensor(T_cam_world[:3, 3], dtype=torch.float32)
+        quaternion, device = se3.quaternion_from_rotation(T_cam_world[:3, :3]), gaussians.means.device
+        rotation = torch.tensor(quaternion, dtype=torch.float32).to(device)
+        translation = torch.tensor(T_cam_world[:3, 3], dtype=torch.float32).to(device)
         optimizer = torch.optim.Adam(
             [
                 {'params': [rotation.requires_grad_()], 'lr': config.rotation_rate},
                 {'params': [translation.requires_grad_()], 'lr': config.translation_rate},
-            ]
+            ],
+            fused=not is_on_host(rotation),
         )
         guess: Candidate | None = None
         steps = config.iterations
@@ -43,11 +46,11 @@ class RenderAndCompareTracker:
             pose = _pose(rotation, translation)
             render = self._rasterizer.render(gaussians, view.camera, pose)
             loss = tracking_loss(render, view, config)
-            candidate = Candidate.of(_float64(pose.detach()), render, view, config, guess, loss)
+            candidate = Candidate.of(pose, render, view, guess, loss)
             if guess is None:
                 guess = best = candidate
-            elif candidate.cost < best.cost:
-                best = candidate
+            else:
+                best = best.or_better(candidate)
             if step == config.iterations and self._is_poor(loss, view):
                 steps = 2 * config.iterations
             if step == steps:
@@ -55,7 +58,7 @@ class RenderAndCompareTracker:
             optimizer.zero_grad()
             loss.total.backward()
             optimizer.step()
-        return judge(best.T_cam_world, best.render, view, config)
+        return judge(_float64(best.pose), best.render, view, config)
 
     def _is_poor(self, loss: TrackingLoss, view: View) -> bool:
         """Whether depth is so far off that more steps are worth it; the original compares the sum over the image."""
@@ -78,5 +81,5 @@ def _pose(quaternion: Tensor, translation: Tensor) -> Tensor:
 
 def _float64(pose: Tensor) -> NDArray[np.float64]:
     """The pose in double precision, its rotation orthonormal to that precision too."""
-    T = pose.double().numpy()
+    T = pose.double().numpy(force=True)
     return se3.compose(se3.quaternion_from_rotation(T[:3, :3]), T[:3, 3])
