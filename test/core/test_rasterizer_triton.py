@@ -167,7 +167,8 @@ def test_ten_frames_find_the_poses_of_the_cpu(room: Callable[..., SyntheticSeque
         f'mapping.optimizer={optimizer}',
     ]  # fmt: skip
     sequence = room(10, 16, noise=False)
-    there, host = (Slam(load_config('splatam', [*few, f'rasterizer={name}'])) for name in ('triton', 'cpu'))
+    there = Slam(load_config('splatam', [*few, 'rasterizer=triton', f'device={DEVICE}']))
+    host = Slam(load_config('splatam', [*few, 'rasterizer=cpu', 'device=cpu']))
     for index in range(10):
         host.restore(there.state())
         found, expected = there.process(sequence[index]), host.process(sequence[index])
