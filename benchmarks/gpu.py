@@ -122,7 +122,8 @@ def gsplat(cam: PinholeCamera) -> Draw | None:
         from gsplat import rasterization
     except ImportError:
         return None
-    K = torch.tensor([[cam.fx, 0, cam.cx + 0.5], [0, cam.fy, cam.cy + 0.5], [0, 0, 1]], device='cuda')  # its pixels begin at corners
+    # Its pixels begin at their corners.
+    K = torch.tensor([[cam.fx, 0, cam.cx + 0.5], [0, cam.fy, cam.cy + 0.5], [0, 0, 1]], device='cuda')
 
     def draw(gaussians: Gaussians, pose: Tensor) -> list[Tensor]:
         turned = gaussians.anisotropic()
@@ -140,23 +141,20 @@ def kernel_row(name: str, draw: Draw, cam: PinholeCamera, still: Gaussians, runs
     pose = torch.eye(4, device=still.means.device)
     pose[0, 3] = 0.003
     moving = with_gradients(still)
-    backwards = _Backward(draw)
     if still.means.is_cuda:
         torch.cuda.reset_peak_memory_stats()
     with torch.no_grad():
         forward = median_ms(lambda: draw(still, pose), runs)
-    both = median_ms(lambda: backwards(moving, pose), runs)
-    to_pose = median_ms(lambda: backwards(still, pose.clone().requires_grad_()), runs)
-    print(f'| {name} | {cam.width}x{cam.height} | {len(still):,} | {forward:.2f} | {both:.2f} | {to_pose:.2f} | {peak_mb()} |', flush=True)
+    both = median_ms(lambda: forth_and_back(draw, moving, pose), runs)
+    to_pose = median_ms(lambda: forth_and_back(draw, still, pose.clone().requires_grad_()), runs)
+    print(f'| {name} | {cam.width}x{cam.height} | {len(still):,} | {forward:.2f} | {both:.2f} | {to_pose:.2f} | {peak_mb()} |',
+          flush=True)  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class _Backward:
-    draw: Draw
-
-    def __call__(self, gaussians: Gaussians, pose: Tensor) -> None:
-        images = self.draw(gaussians, pose)
-        torch.autograd.backward(images, [torch.ones_like(image) for image in images])
+def forth_and_back(draw: Draw, gaussians: Gaussians, pose: Tensor) -> None:
+    """From the parameters to images, and from gradients of one in all of these to the parameters that want some."""
+    images = draw(gaussians, pose)
+    torch.autograd.backward(images, [torch.ones_like(image) for image in images])
 
 
 def peak_mb() -> str:
@@ -207,7 +205,8 @@ class Run:
     def psnr_db(self, frames: Sequence[RgbdFrame]) -> float:
         """Of the final map at the poses found, over pixels with a depth reading."""
         scorer = ViewScorer(self.slam.map.gaussians, make_rasterizer(self.rasterizer), self.slam.config.depth)
-        scores = [scorer.score(frame, pose).scores.psnr_db for frame, pose in zip(frames, self.poses) if pose is not None]
+        tracked = [(frame, pose) for frame, pose in zip(frames, self.poses) if pose is not None]
+        scores = [scorer.score(frame, pose).scores.psnr_db for frame, pose in tracked]
         return float(np.mean([score for score in scores if score is not None]))
 
 
@@ -225,7 +224,8 @@ def run(slam: Slam, frames: Sequence[RgbdFrame], rasterizer: str) -> Run:
 
 def print_frames(plan: Plan, frames: Sequence[RgbdFrame]) -> None:
     """(b): frames per second and memory of the presets. A first run compiles what there is to compile."""
-    print('| preset | image | frames | tracked | fps | ms a frame (median, p95) | Gaussians | peak MB |\n|---|---|---|---|---|---|---|---|')
+    print('| preset | image | frames | tracked | fps | ms a frame (median, p95) | Gaussians | peak MB |')
+    print('|---|---|---|---|---|---|---|---|')
     for preset in ('splatam', 'realtime'):
         run(slam_of(plan, preset), frames[:2], plan.rasterizer)
         if plan.device == 'cuda':
@@ -234,8 +234,8 @@ def print_frames(plan: Plan, frames: Sequence[RgbdFrame]) -> None:
         tracked = sum(pose is not None for pose in done.poses)
         median, p95 = (1e3 * float(np.percentile(done.seconds, share)) for share in (50, 95))
         size = f'{frames[0].camera.width}x{frames[0].camera.height}'
-        print(f'| {preset} | {size} | {len(frames)} | {tracked} | {len(frames) / sum(done.seconds):.2f} | {median:.1f}, {p95:.1f} | '
-              f'{done.slam.num_gaussians:,} | {peak_mb()} |', flush=True)  # fmt: skip
+        print(f'| {preset} | {size} | {len(frames)} | {tracked} | {len(frames) / sum(done.seconds):.2f} | '
+              f'{median:.1f}, {p95:.1f} | {done.slam.num_gaussians:,} | {peak_mb()} |', flush=True)  # fmt: skip
     print()
 
 
@@ -260,8 +260,9 @@ def print_same_state(plan: Plan, preset: str, frames: Sequence[RgbdFrame]) -> No
         for a, b in zip(here, poses) if a is not None and b is not None
     ]  # fmt: skip
     lost = sum((a is None) != (b is None) for a, b in zip(here, poses))
-    print(f'From the same state ({preset}, {len(frames)} frames): poses differ by {apart.max():.4f} mm and {max(turned):.5f} degrees at most, '
-          f'median {np.median(apart):.4f} mm; limit 0.2 mm; {lost} frames tracked by one alone.\n', flush=True)  # fmt: skip
+    print(f'From the same state ({preset}, {len(frames)} frames): poses differ by {apart.max():.4f} mm and {max(turned):.5f} '
+          f'degrees at most, median {np.median(apart):.4f} mm; limit 0.2 mm; {lost} frames tracked by one alone.\n',
+          flush=True)  # fmt: skip
 
 
 def print_free_running(plan: Plan, preset: str, frames: Sequence[RgbdFrame]) -> None:
@@ -271,7 +272,8 @@ def print_free_running(plan: Plan, preset: str, frames: Sequence[RgbdFrame]) -> 
     rms = [float(np.sqrt(np.mean(apart_mm(cpu.poses, run_.poses) ** 2))) for run_ in (there, other)]
     psnr = [run_.psnr_db(frames) for run_ in (cpu, other, there)]
     print(f'| {preset}, {len(frames)} frames, free-running | poses apart, mm RMS | PSNR dB |\n|---|---|---|')
-    print(f'| CPU, seed 0 | 0 | {psnr[0]:.2f} |\n| CPU, seed 1 | {rms[1]:.3f} | {psnr[1]:.2f} |\n| {plan.rasterizer} on {plan.device}, seed 0 | {rms[0]:.3f} | {psnr[2]:.2f} |')
+    print(f'| CPU, seed 0 | 0 | {psnr[0]:.2f} |\n| CPU, seed 1 | {rms[1]:.3f} | {psnr[1]:.2f} |')
+    print(f'| {plan.rasterizer} on {plan.device}, seed 0 | {rms[0]:.3f} | {psnr[2]:.2f} |')
     print(f'\nLimits: {2 * rms[1]:.3f} mm (twice what the seeds differ by), and {psnr[0]:.2f} ± 0.1 dB.\n', flush=True)
 
 
@@ -287,7 +289,8 @@ def print_profile(plan: Plan, preset: str, frames: Sequence[RgbdFrame]) -> None:
         slam.process(frames[-1])
         finish()
     order = 'self_device_time_total' if on_gpu else 'self_cpu_time_total'
-    print(f'Frame {len(frames)} of {preset}:\n\n```\n{profiled.key_averages().table(sort_by=order, row_limit=20, max_name_column_width=60)}\n```\n')
+    table = profiled.key_averages().table(sort_by=order, row_limit=20, max_name_column_width=60)
+    print(f'Frame {len(frames)} of {preset}:\n\n```\n{table}\n```\n')
 
 
 def plan_or_exit(device: str) -> Plan:
@@ -296,7 +299,7 @@ def plan_or_exit(device: str) -> Plan:
         os.environ['TRITON_INTERPRET'] = '1'  # before triton is imported
         return TRIAL
     if not torch.cuda.is_available():
-        sys.exit(f'benchmarks/gpu.py: torch {torch.__version__} finds no CUDA device here; --device cpu tries the script without one')
+        sys.exit(f'benchmarks/gpu.py: torch {torch.__version__} finds no CUDA device; --device cpu tries the script without one')
     return GPU
 
 

@@ -1,8 +1,9 @@
 """The contract on a GPU: kernels in Triton, gradients written by hand.
 
-Nothing waits for the device but the first view, one of a much larger map or image, and whoever reads a result. Sums are taken in a
-fixed order, so that results repeat bit for bit on the same device, with one exception: while a view needs more room than its tile
-lists got (see ``triton_lists.Capacity``), gradients by the map are summed by atomics, in any order.
+Nothing waits for the device but the first view, one of a much larger map or image, and whoever reads a result. Sums are taken in
+a fixed order, so that results repeat bit for bit on the same device, with one exception: while a view needs more room than its
+tile lists got (see ``triton_lists.Capacity``), gradients by the map are summed by atomics, in any order. How soon lists get more
+room depends on when the device answers.
 
 The pose's gradient comes from sums in camera coordinates, which takes the upper left of ``T_cam_world`` to be a rotation.
 """
@@ -29,8 +30,8 @@ except ImportError as error:
 from splatam_core.rasterizer import triton_kernels as kernels
 from splatam_core.rasterizer.triton_lists import BLOCK, Capacity, Lister, View
 
-# Pixels on a tile's side, and splats that a program takes at once. On a GPU these keep to the registers, with two pixels a thread;
-# the interpreter pays by the operation, not by its size.
+# Pixels on a tile's side, and splats that a program takes at once. On a GPU these keep to the registers, with two pixels a
+# thread; the interpreter pays by the operation, not by its size.
 _TILE, _CHUNK = (16, 128) if kernels.INTERPRETED else (8, 4)
 _MAX_STEPS = 255
 
@@ -245,4 +246,6 @@ def _check_fit(gaussians: Gaussians, moments: Moments, target: Target) -> None:
     values = {name: getattr(gaussians, name) for name in ('means', 'log_scales', 'logit_opacities', 'rgb')}
     for name, tensor in (values | {name: entry[0] for name, entry in expected.items()}).items():
         if not tensor.is_contiguous():
-            raise RasterizerError(f'{name} has strides {tensor.stride()}; the triton rasterizer fits contiguous tensors: copy it first')
+            raise RasterizerError(
+                f'{name} has strides {tensor.stride()}; the triton rasterizer fits contiguous tensors: copy it first'
+            )

@@ -1,10 +1,11 @@
 """The kernels of the ``triton`` rasterizer: project, list, blend, and the same way back.
 
-One program blends one tile, a chunk of Gaussians at a time: within a chunk the transmittance in front of each is a running product. Gradients of a list's entries go to the places which the entries had before they were sorted by tile:
-there those of one Gaussian lie side by side, and are summed without atomics.
+One program blends one tile, a chunk of Gaussians at a time: within a chunk the transmittance in front of each is a running
+product. Gradients of a list's entries go to the places which the entries had before they were sorted by tile: there those of one Gaussian
+lie side by side, and are summed without atomics.
 
-An isotropic footprint is separable, but not to advantage here: a tile of 8x8 pixels is two a thread, which share a column, so three
-exponentials would take the place of two.
+An isotropic footprint is separable, but not to advantage here: a tile of 8x8 pixels is two a thread, which share a column, so
+three exponentials would take the place of two.
 
 Written so that Triton's compiler and its interpreter both take them: blocks are powers of two, every load and store is masked or
 known to be inside, loops are ``while`` over scalars.
@@ -56,7 +57,9 @@ def project(
     extent = tl.sqrt(2.0 * variance * (tl.log(tl.maximum(opacity / MIN_ALPHA, 1.0)) + 1e-5))
     drawn = near & (opacity >= MIN_ALPHA)
     drawn = drawn & (u + extent >= 0.0) & (u - extent <= width - 1.0) & (v + extent >= 0.0) & (v - extent <= height - 1.0)
-    first, shape, count = _touched_tiles(tl.where(drawn, u, 0.0), tl.where(drawn, v, 0.0), tl.where(drawn, extent, 0.0), width, height, TILE)
+    first, shape, count = _touched_tiles(
+        tl.where(drawn, u, 0.0), tl.where(drawn, v, 0.0), tl.where(drawn, extent, 0.0), width, height, TILE
+    )
     tl.store(rects + 2 * i, tl.where(drawn, first, 0), mask=real)
     tl.store(rects + 2 * i + 1, tl.where(drawn, shape, 0), mask=real)
     tl.store(counts + i, tl.where(drawn, count, 0), mask=real)
@@ -263,7 +266,7 @@ def _slopes(splat, listed, x, y, T, Q, gr, gg, gb, gd, gs):
 def _to_entries(
     splats, order, entries, slots, gradients, begin, end, fits, x, y, on_image, Q, gr, gg, gb, gd, gs, CHUNK: tl.constexpr
 ):  # fmt: skip
-    """Front to back again, to gradients [rows, 8]: of an entry in its slot; of a Gaussian, by atomics, where lists found no room."""
+    """Front to back again, to gradients [rows, 8]: of entries in their slots; by atomics of Gaussians where lists found no room."""
     T = tl.where(on_image, 1.0, 0.0)
     at, live = begin, tl.max(T, axis=0)
     while (at < end) & (live >= MIN_TRANSMITTANCE):
@@ -426,8 +429,9 @@ def _collected(gradients, starts, counts, total, i, real, capacity, BLOCK: tl.co
     count = tl.load(counts + i, mask=real, other=0)
     start = tl.where(fits, tl.load(starts + i, mask=real, other=0), i.to(tl.int64))
     count = tl.where(fits, count, tl.minimum(count, 1))
-    s0, sx, sy, s2 = tl.zeros([BLOCK], tl.float32), tl.zeros([BLOCK], tl.float32), tl.zeros([BLOCK], tl.float32), tl.zeros([BLOCK], tl.float32)
-    sr, sg, sb, sz = tl.zeros([BLOCK], tl.float32), tl.zeros([BLOCK], tl.float32), tl.zeros([BLOCK], tl.float32), tl.zeros([BLOCK], tl.float32)
+    nothing = tl.zeros([BLOCK], tl.float32)
+    s0, sx, sy, s2 = nothing, nothing, nothing, nothing
+    sr, sg, sb, sz = nothing, nothing, nothing, nothing
     most = tl.max(count, axis=0)
     j = 0
     while j < most:

@@ -64,9 +64,9 @@ class View:
 class Capacity:
     """How much room tile lists get, without waiting for the device on every view.
 
-    The number of entries is read back one view late, while the device works on; room is kept for two fifths more than the most seen
-    lately. The first view, and one of many more Gaussians or pixels than before, waits for its number. A view that needs more than
-    it was given is drawn all the same, slowly: its tiles walk the whole depth order.
+    The number of entries is read back one view late, while the device works on; room is kept for two fifths more than the most
+    seen lately. The first view, and one of many more Gaussians or pixels than before, waits for its number. A view that needs
+    more than it got is drawn all the same, slowly: its tiles walk the whole depth order.
     """
 
     def __init__(self) -> None:
@@ -187,7 +187,7 @@ def _listed(
     """Starts [N]; tile and Gaussian of each entry [capacity], nearest first, the tile past the last where there is none."""
     dtype = torch.int16 if num_tiles <= _MAX_SHORT else torch.int32
     tiles = torch.full((capacity,), num_tiles, dtype=dtype, device=order.device)
-    ids, starts = torch.zeros(capacity, dtype=torch.int32, device=order.device), torch.empty_like(order)
+    ids, starts = torch.empty(capacity, dtype=torch.int32, device=order.device), torch.empty_like(order)
     kernels.launch(
         kernels.list_tiles, triton.cdiv(len(order), BLOCK),
         order, ends, counts, rects, starts, tiles, ids, len(order), capacity, tiles_x, BLOCK=BLOCK, warps=4,

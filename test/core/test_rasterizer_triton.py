@@ -6,6 +6,7 @@ The contract, and agreement with the reference, is in ``test_rasterizer_contract
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -83,10 +84,13 @@ def test_lists_without_room_change_nothing_but_the_time() -> None:
 
 def _fit(rasterizer: TritonRasterizer, scene: Scene) -> tuple[float, torch.Tensor]:
     """Loss, and first moments of one step: gradients, that is."""
-    count = len(scene.gaussians)
-    moments = Moments(torch.zeros(count, 16, device=DEVICE), torch.zeros(count, dtype=torch.uint8, device=DEVICE))
+    moments = _moments(len(scene.gaussians))
     loss = rasterizer.fit(scenes.on_device(scene.gaussians, DEVICE), moments, RATES, _target(scene))
     return float(loss), moments.first_second[:, :8].cpu()
+
+
+def _moments(count: int) -> Moments:
+    return Moments(torch.zeros(count, 16, device=DEVICE), torch.zeros(count, dtype=torch.uint8, device=DEVICE))
 
 
 def _target(scene: Scene) -> Target:
@@ -146,7 +150,7 @@ def test_bounds_grow_with_what_is_fitted() -> None:
     g = gaussians.gaussians
     on_device = Gaussians(*(values.to(DEVICE) for values in (g.means, g.log_scales, g.logit_opacities, g.rgb, g.bounds)))
     before = on_device.bounds.clone()
-    moments = Moments(torch.zeros(len(g), 16, device=DEVICE), torch.zeros(len(g), dtype=torch.uint8, device=DEVICE))
+    moments = _moments(len(g))
     for _ in range(2):
         TritonRasterizer().fit(on_device, moments, Rates(0.05, 0.1, 0.05, 0.01), _target(SCENE))
     lowest, highest = on_device.means.amin(dim=0), on_device.means.amax(dim=0)
@@ -195,9 +199,8 @@ def test_fitting_refuses_what_it_could_not_write_to() -> None:
     gaussians = scenes.on_device(SCENE.gaussians, DEVICE)
     wide = torch.zeros(len(gaussians), 6, device=DEVICE)
     strided = Gaussians(wide[:, ::2], gaussians.log_scales, gaussians.logit_opacities, gaussians.rgb)
-    moments = Moments(torch.zeros(len(gaussians), 16, device=DEVICE), torch.zeros(len(gaussians), dtype=torch.uint8, device=DEVICE))
     with pytest.raises(RasterizerError, match='means has strides'):
-        make_rasterizer('triton').fit(strided, moments, RATES, _target(SCENE))
+        make_rasterizer('triton').fit(strided, _moments(len(gaussians)), RATES, _target(SCENE))
 
 
 def _python(code: str, *arguments: str, **environment: str) -> str:
@@ -251,7 +254,9 @@ POINTERS = {
     'counts': 'i32', 'ids': 'i32', 'entries': 'i32', 'begins': 'i32', 'tiles': 'i16', 'rgb8': 'u8', 'steps': 'u8',
 }
 INTEGERS = {'n', 'rows', 'capacity', 'width', 'height', 'tiles_x'}
-FLOATS = {'fx', 'fy', 'cx', 'cy', 'color_weight', 'depth_weight', 'means_rate', 'log_scales_rate', 'logit_opacities_rate', 'rgb_rate'}
+FLOATS = {
+    'fx', 'fy', 'cx', 'cy', 'color_weight', 'depth_weight', 'means_rate', 'log_scales_rate', 'logit_opacities_rate', 'rgb_rate',
+}
 CONSTANTS = {'TILE': 8, 'CHUNK': 4, 'BLOCK': 256, 'HAS_BOUNDS': True}
 
 def type_of(name):
@@ -276,7 +281,7 @@ LAUNCHED = (
 
 @pytest.mark.parametrize(('target', 'binary'), [('cuda 80 32', 'cubin'), ('hip gfx942 64', 'hsaco')])
 def test_the_compiler_takes_every_kernel(target: str, binary: str, tmp_path: Path) -> None:
-    """Ahead of time, to machine code of a card of either maker, which needs no card: the interpreter takes more than the compiler."""
+    """Ahead of time, to machine code of a card of either maker, without a card: the interpreter takes more than the compiler."""
     said = _python(COMPILE, *target.split(), binary, *LAUNCHED, TRITON_CACHE_DIR=str(tmp_path))
     sizes = dict(line.split() for line in said.splitlines())
     assert tuple(sizes) == LAUNCHED and all(int(size) > 1000 for size in sizes.values())
@@ -284,5 +289,4 @@ def test_the_compiler_takes_every_kernel(target: str, binary: str, tmp_path: Pat
 
 def test_every_kernel_that_is_launched_is_compiled_above() -> None:
     sources = ''.join((ROOT / 'splatam_core/rasterizer' / name).read_text() for name in ('triton.py', 'triton_lists.py'))
-    launched = {line.strip().split(',')[0][len('kernels.') :] for line in sources.splitlines() if line.strip().startswith('kernels.')}
-    assert {name for name in launched if not name.startswith('launch')} == set(LAUNCHED)
+    assert set(re.findall(r'launch\(\s*kernels\.(\w+)', sources)) == set(LAUNCHED)
