@@ -24,6 +24,8 @@ CSRC = 'splatam_core/csrc'
 PACKAGE_XML = ElementTree.parse('package.xml').getroot()
 SYSTEM_PYBIND11 = Path('/usr/include/pybind11/pybind11.h')
 
+HAS_TRITON_WHEEL = "sys_platform == 'linux' and (platform_machine == 'x86_64' or platform_machine == 'aarch64')"
+
 # No -ffast-math and no -march: NaN must stay NaN, and one build must run on every processor of its kind.
 # No -Wpsabi: it warns that wide vectors cross function calls differently per processor; ours cross none.
 COMPILE_FLAGS = [
@@ -122,7 +124,10 @@ setup(
         'lpips': ['lpips>=0.1.4'],
         'mesh': ['open3d>=0.18'],
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
-        'test': ['pytest>=7', 'hypothesis>=6', 'OpenEXR>=3.3', 'pytorch-msssim>=1.0'],
+        'test': [
+            'pytest>=7', 'hypothesis>=6', 'OpenEXR>=3.3', 'pytorch-msssim>=1.0',
+            f'triton>=3.4; {HAS_TRITON_WHEEL}',  # interprets the GPU's kernels; torch's CUDA builds bring their own
+        ],
     },
     entry_points={
         'console_scripts': [

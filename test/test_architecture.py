@@ -16,6 +16,7 @@ PACKAGES = ('msg_adapters', 'splatam_core', 'splatam_ros')
 
 BAG_READER = 'splatam_core.datasets.rosbag'
 EXR_READER = 'splatam_core.datasets.files'
+TRITON = 'splatam_core.rasterizer.triton'  # and its kernels and lists, which only it imports
 OPTIONAL = {'lpips': 'splatam_core.evaluation.similarity', 'open3d': 'splatam_core.export'}
 MESSAGES = {
     'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'rcl_interfaces', 'rosgraph_msgs',
@@ -96,6 +97,8 @@ def breach(module: str, imported: Import) -> str | None:
     package = module.partition('.')[0]
     if imported.top in THREADING or imported.name.startswith('torch.multiprocessing'):
         return None if module in MAY_THREAD else 'threads belong into worker.py, the node and the player'
+    if imported.name.startswith(TRITON) and not imported.deferred and not module.startswith(TRITON):
+        return 'triton is optional: import its rasterizer where it is needed'
     if imported.top in sys.stdlib_module_names or imported.top in MAY_IMPORT[package]:
         return None
     if package == 'msg_adapters' and imported.top in MESSAGES | {'rosbags'}:
@@ -104,6 +107,8 @@ def breach(module: str, imported: Import) -> str | None:
         return None
     if imported.top == 'OpenEXR' and module == EXR_READER:
         return None if imported.deferred else 'OpenEXR is optional: import it where it is needed'
+    if imported.top == 'triton' and module.startswith(TRITON):
+        return None
     if OPTIONAL.get(imported.top) == module:
         return None if imported.deferred else f'{imported.top} is optional: import it where it is needed'
     return f'{package} may import only {", ".join(sorted(MAY_IMPORT[package]))} and the standard library'
@@ -152,6 +157,8 @@ def test_every_import_keeps_to_its_layer() -> None:
         ('splatam_core.datasets.record3d', 'def f():\n    import OpenEXR'),
         ('splatam_core.evaluation.similarity', 'import lpips'),
         ('splatam_core.slam', 'def f():\n    import open3d'),
+        ('splatam_core.slam', 'import triton'),
+        ('splatam_core.slam', 'from splatam_core.rasterizer.triton import TritonRasterizer'),
         ('splatam_core.slam', 'from splatam_ros import node'),
         ('splatam_core.slam', 'from ..splatam_ros import node'),
         ('splatam_core.slam', "import importlib\nimportlib.import_module('rclpy')"),
@@ -180,6 +187,8 @@ def test_a_breach_is_seen(module: str, source: str) -> None:
     [
         ('splatam_core.datasets.rosbag', 'from msg_adapters import images\nfrom rosbags.rosbag2 import Reader'),
         ('splatam_core.slam', 'from . import se3\nfrom .rasterizer.base import Render'),
+        ('splatam_core.rasterizer', 'def f():\n    from splatam_core.rasterizer.triton import TritonRasterizer'),
+        ('splatam_core.rasterizer.triton_lists', 'import triton\nfrom splatam_core.rasterizer import triton_kernels'),
         ('splatam_core.worker', 'import threading'),
         ('splatam_core.datasets.files', 'def f():\n    import OpenEXR'),
         ('splatam_core.export', 'def f():\n    import open3d'),

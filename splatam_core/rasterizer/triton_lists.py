@@ -150,7 +150,8 @@ class Lister:
         splats, depths, rects, counts = _projected(gaussians, camera, pose, self._tile)
         order = torch.sort(depths, stable=True).indices
         ends = torch.cumsum(counts[order], dim=0, dtype=torch.int64)
-        total = ends[-1:] if len(order) else ends.new_zeros(1)
+        # A copy, since where a slice ends up in memory may vary, and kernels are compiled anew for other alignments.
+        total = ends[-1:].clone() if len(order) else ends.new_zeros(1)
         capacity = self._capacity.of(total, len(order), tiles_x * tiles_y)
         starts, tiles, ids = _listed(order, ends, counts, rects, capacity, tiles_x, tiles_x * tiles_y)
         tiles, slots = torch.sort(tiles, stable=True)

@@ -155,18 +155,27 @@ def test_bounds_grow_with_what_is_fitted() -> None:
     assert (bounds[:3] <= before[0, :3]).all() and (bounds[3:] >= before[0, 3:]).all() and not torch.equal(bounds, before[0])
 
 
-@pytest.mark.parametrize('more', [['densification.scale=0.6'], ['mapping.optimizer=fused', 'mapping.first_iterations=3']])
-def test_ten_frames_find_the_poses_of_the_cpu(room: Callable[..., SyntheticSequence], more: list[str]) -> None:
-    """The whole of ``Slam.process``; from the same state poses agree within 0.2 mm, the issue's limit."""
-    few = ['threads=1', 'tracking.iterations=3', 'mapping.iterations=2', 'mapping.prune_scale=1.0', 'keyframes.every=3']
-    sequence = room(10, 32, noise=False)
-    there, host = (Slam(load_config('splatam', [*few, *more, f'rasterizer={name}'])) for name in ('triton', 'cpu'))
+@pytest.mark.parametrize('optimizer', ['autograd', 'fused'])
+def test_ten_frames_find_the_poses_of_the_cpu(room: Callable[..., SyntheticSequence], optimizer: str) -> None:
+    """The whole of ``Slam.process``; from the same state poses agree within 0.2 mm, the limit that GPUs are held to.
+
+    Few pixels and steps, for the interpreter's sake, and short ones, so that a step or two find a better pose than the guess.
+    """
+    few = [
+        'threads=1', 'tracking.iterations=3', 'tracking.translation_rate=0.0005', 'tracking.rotation_rate=0.0001',
+        'mapping.iterations=2', 'mapping.first_iterations=2', 'mapping.prune_scale=1.0', 'keyframes.every=3',
+        f'mapping.optimizer={optimizer}',
+    ]  # fmt: skip
+    sequence = room(10, 16, noise=False)
+    there = Slam(load_config('splatam', [*few, 'rasterizer=triton', f'device={DEVICE}']))
+    host = Slam(load_config('splatam', [*few, 'rasterizer=cpu', 'device=cpu']))
     for index in range(10):
         host.restore(there.state())
         found, expected = there.process(sequence[index]), host.process(sequence[index])
         assert found.status is expected.status is (Status.TRACKED if index else Status.INITIALIZED)
-        assert np.abs(found.T_world_cam[:3, 3] - expected.T_world_cam[:3, 3]).max() < 2e-4
+        assert np.abs(found.T_world_cam - expected.T_world_cam).max() < 2e-4
         assert found.num_gaussians == pytest.approx(expected.num_gaussians, abs=2)  # a pixel on the silhouette's limit
+    assert np.abs(found.T_world_cam[:3, 3]).max() > 1e-3
 
 
 def test_anisotropic_gaussians_are_refused() -> None:
