@@ -18,43 +18,32 @@ from splatam_core.view import View
 
 Room = Callable[..., SyntheticSequence]
 
-WIDTHS = {'splatam': 32, 'realtime': 48}  # pixels are 8 cm, or 5
-FEW_STEPS = {
-    'splatam': (
-        'tracking.iterations=1', 'mapping.iterations=1', 'mapping.first_iterations=2', 'keyframes.every=2',
-        'mapping.prune_scale=1.0', 'tracking.silhouette_threshold=0.7', 'tracking.min_sure_fraction=0.1',
-    ),
-    'realtime': (
-        'mapping.first_iterations=3', 'mapping.iterations=1', 'keyframes.every=2', 'mapping.prune_scale=1.0',
-        'tracking.silhouette_threshold=0.7', 'tracking.min_sure_fraction=0.1', 'tracking.iterations=8',
-    ),
-}  # fmt: skip
-
-# Metres and radians. Alignment of some thousand points, 5 cm apart, is decided by the few that a rounding takes in or leaves
-# out; where there are enough of them it is as close as the paper's tracker, see below.
-TOLERANCE = {'splatam': 2e-4, 'realtime': 1e-2}
+WIDTH = 48
+FEW_STEPS = (
+    'mapping.first_iterations=3', 'mapping.iterations=1', 'keyframes.every=2', 'mapping.prune_scale=1.0',
+    'tracking.silhouette_threshold=0.7', 'tracking.min_sure_fraction=0.1', 'tracking.iterations=8',
+)  # fmt: skip
+# Metres and radians: a fifth of a pixel. Alignment of so few points is decided by those on the border, which a rounding takes
+# in or leaves out. Where there are enough it is far closer, see below; for the paper's tracker see test_rasterizer_triton.py.
+TOLERANCE = 1e-2
 
 
-def _config(preset: str, rasterizer: str) -> SlamConfig:
-    return load_config(preset, ['threads=1', f'rasterizer={rasterizer}', *FEW_STEPS[preset]])
+def _config(rasterizer: str) -> SlamConfig:
+    return load_config('realtime', ['threads=1', f'rasterizer={rasterizer}', *FEW_STEPS])
 
 
-@pytest.mark.parametrize('preset', FEW_STEPS)
-def test_ten_frames_are_those_of_the_native_rasterizer(preset: str, room: Room) -> None:
-    """Each from the same state, which moves between the two without loss: as good as the same poses, as many Gaussians."""
-    sequence = room(10, WIDTHS[preset], noise=False)
-    native, triton = Slam(_config(preset, 'cpu')), Slam(_config(preset, 'triton'))
+def test_ten_frames_of_realtime_are_those_of_the_native_rasterizer(room: Room) -> None:
+    """Each from the same state, which moves between the two without loss: the same frames tracked, as many Gaussians."""
+    sequence = room(10, WIDTH, noise=False)
+    native, triton = Slam(_config('cpu')), Slam(_config('triton'))
     for index in range(10):
         state = triton.state()
         native.restore(state)
         assert all(np.array_equal(values, state.map[name]) for name, values in native.state().map.items())
         found, expected = triton.process(sequence[index]), native.process(sequence[index])
         assert found.status is expected.status is (Status.TRACKED if index else Status.INITIALIZED)
-        assert np.abs(found.T_world_cam - expected.T_world_cam).max() < TOLERANCE[preset]
+        assert np.abs(found.T_world_cam - expected.T_world_cam).max() < TOLERANCE
         assert found.num_gaussians == pytest.approx(expected.num_gaussians, rel=0.01) and found.num_gaussians > 400
-    drawn, expected_view = (slam.render(found.T_world_cam) for slam in (triton, native))
-    difference = drawn.rgb.astype(int) - expected_view.rgb
-    assert np.sqrt((difference**2).mean()) < 6  # after a last step of mapping each took for itself; 8 bits
 
 
 def test_alignment_to_an_interpreted_render_finds_the_same_pose(room: Room) -> None:
