@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
 from splatam_core import checkpoints, cli, resuming
@@ -39,7 +40,7 @@ SOURCE = ['synthetic:noise=off', '--width', str(WIDTH), '--max-frames', str(FRAM
 PRESETS = ('quick', 'splatam', 'realtime')
 FAST = ['threads=1', 'mapping.iterations=6', 'keyframes.every=2', 'keyframes.window=3']
 ITERATIONS = {'quick': 6, 'splatam': 8, 'realtime': 6}
-MEASURED = {'fps', 'fps_with_io', 'timings_ms', 'peak_rss_mb'}  # times, and the memory of one process
+MEASURED = {'fps', 'fps_with_io', 'timings_ms', 'peak_rss_mb', 'peak_gpu_mb'}  # times, and the memory of one process
 PROGRESS = Progress(FRAMES, 3, '0' * 64, 4)
 
 
@@ -176,6 +177,21 @@ def test_ctrl_c_saves_a_checkpoint_of_the_last_frame(
     assert read_newest(tmp_path / 'run' / 'checkpoints').progress.num_lines == 4
     assert splatam('run', '--resume', tmp_path / 'run', '--no-evaluate') == 0
     assert result(tmp_path / 'run') == result(whole['quick'])
+
+
+def test_a_run_from_a_gpu_goes_on_without_one(
+    run: Path, whole: dict[str, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where a run is computed may change; not unasked."""
+    monkeypatch.setattr(torch.cuda, 'is_available', lambda: False)
+    config = run / 'config.yaml'
+    config.write_text(config.read_text().replace('device: auto', 'device: cuda'))
+    assert splatam('run', '--resume', run, '--no-evaluate') == cli.EXIT_ERROR
+    assert 'device = cuda' in capsys.readouterr().err
+    assert splatam('run', '--resume', run, '--device', 'cpu', '--no-evaluate') == 0
+    assert result(run) == result(whole['quick'])
+    assert 'device: cpu' in config.read_text()
+    assert json.loads((run / 'run.json').read_text())['resumed'][-1]['backend'] == 'device = cpu; rasterizer: cpu'
 
 
 def test_a_finished_run_may_be_resumed(whole: dict[str, Path], tmp_path: Path) -> None:

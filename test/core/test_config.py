@@ -73,7 +73,7 @@ def test_yaml_round_trip(tmp_path: Path) -> None:
         ('tracking.iterations=-1', 'expected a whole number at least 0'),
         ('tracking.silhouette_threshold=1.5', 'at least 0 and at most 1'),
         ('tracking.silhouette_threshold=nan', 'at least 0 and at most 1'),
-        ('rasterizer=cuda', 'one of cpu, reference'),
+        ('rasterizer=cuda', 'one of auto, cpu, triton, reference'),
         ('depth.min_m=200', 'less than depth.max_m'),
     ],
 )
