@@ -109,7 +109,7 @@ def _fitted(rasterizer: Rasterizer, scene: Scene, steps: int) -> tuple[list[torc
 @pytest.mark.parametrize('name', ['random', 'odd size', 'smaller than a tile', 'many, deep', 'behind the camera', 'empty', 'opaque'])
 @pytest.mark.parametrize(('backend', 'threads'), BACKENDS)
 def test_fitting_steps_equal_the_reference(name: str, backend: str, threads: int) -> None:
-    """Five steps of rendering, L1 and Adam in one native call, against the same written with autograd."""
+    """Five steps of rendering, Huber's loss and Adam in one native call, against the same written with autograd."""
     expected, expected_moments, expected_losses = _fitted(ReferenceRasterizer(), SCENES[name], 5)
     actual, moments, losses = _fitted(make_rasterizer(backend, threads), SCENES[name], 5)
     assert losses == pytest.approx(expected_losses, rel=1e-5, abs=1e-7)  # float32 sums over the image
