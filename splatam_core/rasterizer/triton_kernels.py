@@ -26,6 +26,7 @@ BLUR_PX2 = tl.constexpr(base.BLUR_PX2)
 MAX_ALPHA = tl.constexpr(base.MAX_ALPHA)
 MIN_ALPHA = tl.constexpr(base.MIN_ALPHA)
 MIN_TRANSMITTANCE = tl.constexpr(base.MIN_TRANSMITTANCE)
+COLOR_LIMIT, DEPTH_LIMIT_M = tl.constexpr(base.COLOR_LIMIT), tl.constexpr(base.DEPTH_LIMIT_M)
 BETA_1, BETA_2, EPSILON = tl.constexpr(base.BETA_1), tl.constexpr(base.BETA_2), tl.constexpr(base.EPSILON)
 FIELDS = tl.constexpr(8)  # of a splat (u, v, falloff, opacity, r, g, b, z) and of its gradient, as in csrc/kernels.hpp
 
@@ -490,11 +491,12 @@ def project_backward(
 
 
 @triton.jit
-def _difference(drawn, wanted, weight, counted):
-    """[P] L1, and its gradient."""
+def _difference(drawn, wanted, weight, limit, counted):
+    """[P] Huber's loss, and its gradient: a parabola up to the limit, a line beyond."""
     difference = tl.where(counted, drawn - wanted, 0.0)
-    gradient = tl.where(difference > 0.0, weight, 0.0) - tl.where(difference < 0.0, weight, 0.0)
-    return gradient * difference, gradient
+    size = tl.abs(difference)
+    loss = tl.where(size <= limit, difference * difference / (2.0 * limit), size - 0.5 * limit)
+    return weight * loss, weight * tl.minimum(tl.maximum(difference / limit, -1.0), 1.0)
 
 
 @triton.jit(do_not_specialize=['n', 'capacity'])
@@ -502,7 +504,7 @@ def fit_tile(
     splats, order, entries, slots, begins, total, rgb8, depth, readings, gradients, losses,
     n, capacity, width, height, tiles_x, color_weight, depth_weight, TILE: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
-    """Blend a tile, compare it with the target rgb8 [H, W, 3] and depth [H, W] (L1), and go back, in one go; losses [tiles]."""
+    """Blend a tile, compare it with the target rgb8 [H, W, 3] and depth [H, W], and go back, in one go; losses [tiles]."""
     column, row, on_image = _pixels(tiles_x, width, height, TILE)
     x, y, at = column.to(tl.float32), row.to(tl.float32), row * width + column
     begin, end, fits = _span(begins, total, tl.program_id(0), n, capacity)
@@ -512,10 +514,10 @@ def fit_tile(
     blue = tl.load(rgb8 + 3 * at + 2, mask=on_image, other=0).to(tl.float32) / 255.0
     range_m = tl.load(depth + at, mask=on_image, other=0.0)
     weight = depth_weight / tl.maximum(tl.load(readings), 1).to(tl.float32)
-    loss_r, gr = _difference(r, red, color_weight, on_image)
-    loss_g, gg = _difference(g, green, color_weight, on_image)
-    loss_b, gb = _difference(b, blue, color_weight, on_image)
-    loss_d, gd = _difference(d, range_m, weight, on_image & (range_m > 0.0))
+    loss_r, gr = _difference(r, red, color_weight, COLOR_LIMIT, on_image)
+    loss_g, gg = _difference(g, green, color_weight, COLOR_LIMIT, on_image)
+    loss_b, gb = _difference(b, blue, color_weight, COLOR_LIMIT, on_image)
+    loss_d, gd = _difference(d, range_m, weight, DEPTH_LIMIT_M, on_image & (range_m > 0.0))
     tl.store(losses + tl.program_id(0), tl.sum(loss_r + loss_g + loss_b + loss_d, axis=0))
     _to_entries(
         splats, order, entries, slots, gradients, begin, end, fits, x, y, on_image,
