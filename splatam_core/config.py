@@ -212,7 +212,7 @@ class MappingConfig:
     )
     optimizer: str = _setting(
         'autograd',
-        "The paper's: Adam started anew on every mapped frame; or one native step that renders, compares (L1 only) and "
+        "The paper's: Adam started anew on every mapped frame; or one native step that renders, compares (Huber, no SSIM) and "
         'moves what is visible.',
         choices=('autograd', 'fused'),
     )

@@ -113,8 +113,9 @@ static void align(const float* brightness, const float* depth, const Camera& cam
       sums.compared += count(d.inside & (frame[3] == frame[3]));
       IntLanes seen = d.inside & (absolute(depth_residual) < settings.max_depth_ratio);  // NaN is not
       Lanes by_light[kUnknowns], by_depth[6];
-      slopes_by_twist(frame[4] * camera.fx * d.inverse_z, frame[5] * camera.fy * d.inverse_z, d.x, d.y, d.z, d.inverse_z,
-                      by_depth);
+      const Lanes tilt_x = frame[4] * camera.fx * d.inverse_z, tilt_y = frame[5] * camera.fy * d.inverse_z;
+      const Lanes upright = 1.0f / sqrt(1.0f + tilt_x * tilt_x + tilt_y * tilt_y);
+      slopes_by_twist(tilt_x, tilt_y, d.x, d.y, d.z, d.inverse_z, by_depth);
       by_depth[2] -= 1.0f;
       by_depth[3] -= d.y;
       by_depth[4] += d.x;
@@ -125,7 +126,7 @@ static void align(const float* brightness, const float* depth, const Camera& cam
       }
       sums.seen += count(seen);
       Lanes light_residual = keep(seen, frame[0] - (settings.gain * light + settings.bias));
-      depth_residual = keep(seen, depth_residual);
+      depth_residual = keep(seen, depth_residual * upright);
       tally(histogram.light, light_residual, seen);
       tally(histogram.depth, depth_residual, seen);
       sums.agreeing += count(seen & (absolute(light_residual) <= settings.inlier_light) &
@@ -138,7 +139,7 @@ static void align(const float* brightness, const float* depth, const Camera& cam
       by_light[8] = Lanes{};
       for (int i = 0; i < 6; ++i) by_light[8] += by_light[i] * settings.velocity[i];
       for (int i = 0; i < kUnknowns; ++i) by_light[i] = keep(seen, by_light[i]);
-      for (int i = 0; i < 6; ++i) by_depth[i] = keep(seen, by_depth[i] * d.inverse_z);
+      for (int i = 0; i < 6; ++i) by_depth[i] = keep(seen, by_depth[i] * d.inverse_z * upright);
 
       const float light_precision = 1.0f / (settings.light_scale * settings.light_scale);
       const float depth_precision = 1.0f / (settings.depth_scale * settings.depth_scale);

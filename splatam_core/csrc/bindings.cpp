@@ -60,7 +60,7 @@ double fit(Engine& engine, Array& means, Array& log_scales, Array& logit_opaciti
            const py::object& bounds, Array& moments, py::array_t<std::uint8_t, py::array::c_style>& steps,
            const std::array<float, 4>& rates, const Array& T_cam_world, float fx, float fy, float cx, float cy,
            const py::array_t<std::uint8_t, py::array::c_style>& target_rgb, const Array& target_depth,
-           float color_weight, float depth_weight) {
+           float color_weight, float depth_weight, float color_limit, float depth_limit) {
   const MutableGaussians gaussians{means.mutable_data(), log_scales.mutable_data(), logit_opacities.mutable_data(),
                                    rgb.mutable_data()};
   const auto count = std::size_t(means.shape(0));
@@ -68,7 +68,7 @@ double fit(Engine& engine, Array& means, Array& log_scales, Array& logit_opaciti
   const Pose pose = pose_of(T_cam_world);
   const AdamState adam{moments.mutable_data(), steps.mutable_data()};
   const AdamRates steps_of{rates[0], rates[1], rates[2], rates[3]};
-  const Target target{target_rgb.data(), target_depth.data(), color_weight, depth_weight};
+  const Target target{target_rgb.data(), target_depth.data(), color_weight, depth_weight, color_limit, depth_limit};
   float* limits = optional_data(bounds);
   py::gil_scoped_release release;
   return engine.fit(gaussians, count, limits, adam, steps_of, camera, pose, target);

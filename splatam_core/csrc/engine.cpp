@@ -158,20 +158,18 @@ void Engine::sort_by_depth(View& view) {
 void Engine::list_tiles(View& view) {
   const std::size_t tiles = std::size_t(view.tiles_x) * view.tiles_y, visible = view.order.size();
   const int parts = pool_.size();
-  std::vector<std::size_t> places(tiles * parts, 0);  // per thread, per tile: a thread lists its share of the order
-  const auto each_touched = [&](int thread, auto&& visit) {
+  std::vector<std::uint32_t> places(tiles * parts, 0);  // per thread, per tile: a thread lists its share of the order
+  view.sorted_rects.resize(visible);
+  pool_.run([&](int thread) {
+    std::uint32_t* counts = places.data() + tiles * thread;
     const std::size_t last = part(visible, thread + 1, parts);
     for (std::size_t i = part(visible, thread, parts); i < last; ++i) {
-      const std::uint32_t splat = std::uint32_t(view.order[i]);
-      visit_tiles(view.rects[splat], view.tiles_x, [&](int tile) { visit(tile, splat); });
+      const TileRect rect = view.sorted_rects[i] = view.rects[std::uint32_t(view.order[i])];
+      visit_tiles(rect, view.tiles_x, [counts](int tile) { ++counts[tile]; });
     }
-  };
-  pool_.run([&](int thread) {
-    std::size_t* counts = places.data() + tiles * thread;
-    each_touched(thread, [counts](int tile, std::uint32_t) { ++counts[tile]; });
   });
   view.tile_begins.resize(tiles + 1);
-  std::size_t place = 0;
+  std::uint32_t place = 0;
   for (std::size_t tile = 0; tile < tiles; ++tile) {
     view.tile_begins[tile] = place;
     for (int thread = 0; thread < parts; ++thread) place += std::exchange(places[tiles * thread + tile], place);
@@ -179,8 +177,12 @@ void Engine::list_tiles(View& view) {
   view.tile_begins[tiles] = place;
   view.entries.resize(place);
   pool_.run([&](int thread) {
-    std::size_t* next = places.data() + tiles * thread;
-    each_touched(thread, [&, next](int tile, std::uint32_t splat) { view.entries[next[tile]++] = splat; });
+    std::uint32_t* next = places.data() + tiles * thread;
+    const std::size_t last = part(visible, thread + 1, parts);
+    for (std::size_t i = part(visible, thread, parts); i < last; ++i) {
+      const std::uint32_t splat = std::uint32_t(view.order[i]);
+      visit_tiles(view.sorted_rects[i], view.tiles_x, [&view, next, splat](int tile) { view.entries[next[tile]++] = splat; });
+    }
   });
 }
 

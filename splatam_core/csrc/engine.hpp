@@ -19,7 +19,7 @@ struct View {
   Pose pose;
   std::size_t num_gaussians = 0;
   std::vector<Splat> splats;
-  std::vector<TileRect> rects;
+  std::vector<TileRect> rects, sorted_rects;  // the latter by depth
   std::vector<std::uint32_t> ids;        // splat -> Gaussian
   std::vector<std::size_t> block_sizes;  // visible Gaussians per block
   std::vector<std::uint64_t> order, scratch;  // depth bits << 32 | splat
@@ -47,7 +47,7 @@ class Engine : public std::enable_shared_from_this<Engine> {
   void backward(View&, const GaussianArrays&, const ConstImages& drawn, const ConstImages& gradient,
                 const MapGradients& map, float pose_gradient[12]);
 
-  // One Adam step of the visible Gaussians towards a target seen from a pose (L1). Returns the loss before it.
+  // One Adam step of the visible Gaussians towards a target seen from a pose (Huber). Returns the loss before it.
   double fit(const MutableGaussians&, std::size_t count, float* bounds, const AdamState&, const AdamRates&,
              const Camera&, const Pose&, const Target&);
 

@@ -61,6 +61,7 @@ struct Target {
   const std::uint8_t* rgb;  // [H, W, 3]
   const float* depth;       // [H, W] metres, 0 = no reading
   float color_weight, depth_weight;
+  float color_limit, depth_limit;  // up to which Huber's loss is a parabola
 };
 
 // Adam (Kingma and Ba 2015). A Gaussian's values in this order: mean, log scale, logit opacity, rgb.
@@ -136,7 +137,7 @@ struct Kernels {
   // Adds to gradients. Without `map`, the colour gradients stay as they are.
   void (*backward)(const TileList&, const Splat*, const Camera&, const ConstImages& drawn, const ConstImages& gradient,
                    bool map, SplatGradient* gradients);
-  // Blends a tile, compares it to the target (L1) and adds the gradients in one go. Returns the tile's loss.
+  // Blends a tile, compares it to the target (Huber) and adds the gradients in one go. Returns the tile's loss.
   // `prints` is scratch of kFloatsPerPrint for each splat of the list.
   double (*fit)(const TileList&, const Splat* splats, const Camera&, const Target&, float* prints,
                 SplatGradient* gradients);

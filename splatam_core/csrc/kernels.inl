@@ -81,12 +81,19 @@ static inline IntLanes on_image(const TileList& tile, const Camera& camera, int 
   return iota() < columns;
 }
 
-static inline bool opaque(const Lanes* transmittance) {
-  IntLanes open{};
-  for (int row = 0; row < kTile; ++row) open |= transmittance[row] >= kMinTransmittance;
-  std::int32_t any = 0;
-  for (int i = 0; i < 8; ++i) any |= open[i];
-  return !any;
+constexpr int kPairs = kTile / 2;
+
+// Whether no pixel of a tile takes any more; Rows is Pixels or Slopes. To be asked after 16 splats at most: until then
+// the transmittance of those that do not has become small, but no denormal number.
+template <typename Rows>
+static inline bool opaque(Rows* rows) {
+  IntPair open{};
+  for (int i = 0; i < kPairs; ++i) {
+    const IntPair more = rows[i].T >= kMinTransmittance;
+    rows[i].T = either(more, rows[i].T, Pair{} + 0.5f * kMinTransmittance);
+    open |= more;
+  }
+  return !any(open);
 }
 
 static inline Lanes load_row(const float* plane, const TileList& tile, const Camera& camera, int row) {
@@ -105,116 +112,140 @@ static inline void store_row(float* plane, const TileList& tile, const Camera& c
   __builtin_memcpy(plane + std::size_t(tile.y + row) * camera.width + tile.x, values, sizeof(float) * columns);
 }
 
-static inline void start_transmittance(Lanes* transmittance, const TileList& tile, const Camera& camera) {
-  for (int row = 0; row < kTile; ++row) transmittance[row] = keep(on_image(tile, camera, row), splat(1.0f));
+static inline Pair load_rows(const float* plane, const TileList& tile, const Camera& camera, int row) {
+  return pair(load_row(plane, tile, camera, row), load_row(plane, tile, camera, row + 1));
 }
 
-struct Row {  // eight pixels being blended
-  Lanes T, r, g, b, depth, silhouette;
+static inline void store_rows(float* plane, const TileList& tile, const Camera& camera, int row, Pair values) {
+  store_row(plane, tile, camera, row, upper(values));
+  store_row(plane, tile, camera, row + 1, lower(values));
+}
+
+static inline Pair first_transmittance(const TileList& tile, const Camera& camera, int row) {
+  return pair(keep(on_image(tile, camera, row), splat(1.0f)), keep(on_image(tile, camera, row + 1), splat(1.0f)));
+}
+
+struct Pixels {  // two rows being blended
+  Pair T, r, g, b, depth, silhouette;
 };
 
-static inline void blend(Row& row, Lanes raw_alpha, const Splat& s) {
-  const Lanes alpha = min(raw_alpha, splat(kMaxAlpha));
-  const Lanes w = keep((alpha >= kMinAlpha) & (row.T >= kMinTransmittance), alpha * row.T);
-  row.r += w * s.r;
-  row.g += w * s.g;
-  row.b += w * s.b;
-  row.depth += w * s.z;
-  row.silhouette += w;
-  row.T -= w;
+static inline void start(Pixels* pixels, const TileList& tile, const Camera& camera) {
+  for (int i = 0; i < kPairs; ++i) {
+    pixels[i] = Pixels{};
+    pixels[i].T = first_transmittance(tile, camera, 2 * i);
+  }
 }
 
-static inline bool opaque(const Row* rows) {
-  Lanes T[kTile];
-  for (int row = 0; row < kTile; ++row) T[row] = rows[row].T;
-  return opaque(T);
+static inline void blend(Pixels& pixels, Pair raw_alpha, const Splat& s) {
+  const Pair alpha = keep(raw_alpha >= kMinAlpha, min(raw_alpha, kMaxAlpha));
+  const Pair w = keep(pixels.T >= kMinTransmittance, alpha * pixels.T);
+  pixels.r += w * s.r;
+  pixels.g += w * s.g;
+  pixels.b += w * s.b;
+  pixels.depth += w * s.z;
+  pixels.silhouette += w;
+  pixels.T *= 1.0f - alpha;  // also of pixels that take no more: the shortest way to the next splat's T
 }
 
-// Splats are taken in batches, two rows at a time: the pixels stay in registers, and while one row's transmittance
-// waits for its last splat, the other's moves on.
+// A splat's alpha in two rows, not clamped.
+static inline Pair raw_alpha(const Footprint& f, int row) {
+  return pair(f.down[row], f.down[row + 1]) * pair(f.across, f.across);
+}
+
+constexpr std::size_t kBatch = 16;
+
+// Blends up to kBatch splats into a tile. Pair by pair: the pixels stay in registers. No pair is left out where a splat
+// does not reach: branches that are guessed wrong cost more than blending nothing.
+static inline void blend(Pixels* pixels, const Splat* batch, const Footprint* prints, std::size_t size) {
+  for (int i = 0; i < kPairs; ++i) {
+    Pixels rows = pixels[i];
+    for (std::size_t k = 0; k < size; ++k)
+      blend(rows, raw_alpha(prints[k], 2 * i), batch[k]);
+    pixels[i] = rows;
+  }
+}
+
 static void forward(const TileList& tile, const Splat* splats, const Camera& camera, const Images& images) {
-  constexpr std::size_t kBatch = 16;
   const std::size_t plane = std::size_t(camera.width) * camera.height;
-  Row rows[kTile] = {};
-  for (int row = 0; row < kTile; ++row) rows[row].T = keep(on_image(tile, camera, row), splat(1.0f));
+  Pixels pixels[kPairs];
+  start(pixels, tile, camera);
   Splat batch[kBatch];
   Footprint prints[kBatch];
-  for (std::size_t first = 0; first < tile.count && !opaque(rows); first += kBatch) {
+  for (std::size_t first = 0; first < tile.count && !opaque(pixels); first += kBatch) {
     const std::size_t size = tile.count - first < kBatch ? tile.count - first : kBatch;
-    for (std::size_t i = 0; i < size; ++i) {
-      batch[i] = splats[tile.splats[first + i]];
-      prints[i] = footprint(batch[i], tile);
+    for (std::size_t k = 0; k < size; ++k) {
+      batch[k] = splats[tile.splats[first + k]];
+      prints[k] = footprint(batch[k], tile);
     }
-    for (int row = 0; row < kTile; row += 2) {
-      Row upper = rows[row], lower = rows[row + 1];
-      for (std::size_t i = 0; i < size; ++i) {
-        const Footprint& f = prints[i];
-        if ((f.down[row] < kMinAlpha) & (f.down[row + 1] < kMinAlpha)) continue;
-        blend(upper, f.down[row] * f.across, batch[i]);
-        blend(lower, f.down[row + 1] * f.across, batch[i]);
-      }
-      rows[row] = upper;
-      rows[row + 1] = lower;
-    }
+    blend(pixels, batch, prints, size);
   }
-  for (int row = 0; row < kTile; ++row) {
-    store_row(images.rgb, tile, camera, row, rows[row].r);
-    store_row(images.rgb + plane, tile, camera, row, rows[row].g);
-    store_row(images.rgb + 2 * plane, tile, camera, row, rows[row].b);
-    store_row(images.depth, tile, camera, row, rows[row].depth);
-    store_row(images.silhouette, tile, camera, row, rows[row].silhouette);
+  for (int i = 0; i < kPairs; ++i) {
+    store_rows(images.rgb, tile, camera, 2 * i, pixels[i].r);
+    store_rows(images.rgb + plane, tile, camera, 2 * i, pixels[i].g);
+    store_rows(images.rgb + 2 * plane, tile, camera, 2 * i, pixels[i].b);
+    store_rows(images.depth, tile, camera, 2 * i, pixels[i].depth);
+    store_rows(images.silhouette, tile, camera, 2 * i, pixels[i].silhouette);
   }
 }
 
-// Front to back again. With q_k = sum over channels of (gradient times what k adds) and Q what is still to come of
-// sum_k w_k q_k, the whole backward pass is dL/dalpha_k = T_k q_k - Q / (1 - alpha_k).
+// Two rows on the way back, which goes front to back again.
+struct Slopes {
+  Pair T, Q;                           // transmittance; what is still to come of sum_k w_k q_k, see descend()
+  Pair r, g, b, depth, silhouette;     // the loss's gradient by what the pixels show
+};
+
+// One splat of the backward pass. With q_k = sum over channels of (gradient times what k adds), the whole of it is
+// dL/dalpha_k = T_k q_k - Q / (1 - alpha_k).
+template <bool kMap>
+static inline void descend(Slopes* slopes, const Splat& s, const Footprint& f, SplatGradient& gradient) {
+  Pair by_alpha{}, by_y{}, by_y_squared{}, by_r{}, by_g{}, by_b{}, by_z{};
+  for (int i = 0; i < kPairs; ++i) {
+
+    Slopes& at = slopes[i];
+    const Pair raw = raw_alpha(f, 2 * i), dy = pair(f.dy[2 * i], f.dy[2 * i + 1]);
+    const Pair alpha = keep(raw >= kMinAlpha, min(raw, kMaxAlpha));
+    const IntPair takes = at.T >= kMinTransmittance;
+    const Pair w = keep(takes, alpha * at.T), left = 1.0f - alpha;
+    const Pair q = at.r * s.r + at.g * s.g + at.b * s.b + at.depth * s.z + at.silhouette;
+    at.Q -= w * q;
+    const Pair slope = keep(takes & (raw <= kMaxAlpha), alpha * (at.T * q - at.Q / left));
+    by_alpha += slope;
+    by_y += slope * dy;
+    by_y_squared += slope * dy * dy;
+    if (kMap) {
+      by_r += w * at.r;
+      by_g += w * at.g;
+      by_b += w * at.b;
+    }
+    by_z += w * at.depth;
+    at.T *= left;
+  }
+  const auto folded = [](Pair rows) { return upper(rows) + lower(rows); };
+  const Lanes by_column = folded(by_alpha), by_x = by_column * f.dx;
+  const Lanes sums[8] = {by_column,    by_x,         folded(by_y), by_x * f.dx + folded(by_y_squared),
+                         folded(by_r), folded(by_g), folded(by_b), folded(by_z)};  // as in SplatGradient
+  float* into = &gradient.log_alpha;
+  store(into, load(into) + row_sums(sums));
+}
+
 template <bool kMap>
 static inline void backward_tile(const TileList& tile, const Splat* splats, const Camera& camera,
                                  const ConstImages& drawn, const ConstImages& gradient, SplatGradient* gradients) {
   const std::size_t plane = std::size_t(camera.width) * camera.height;
-  Lanes T[kTile], Q[kTile], gr[kTile], gg[kTile], gb[kTile], gd[kTile], gs[kTile];
-  start_transmittance(T, tile, camera);
-  for (int row = 0; row < kTile; ++row) {
-    gr[row] = load_row(gradient.rgb, tile, camera, row);
-    gg[row] = load_row(gradient.rgb + plane, tile, camera, row);
-    gb[row] = load_row(gradient.rgb + 2 * plane, tile, camera, row);
-    gd[row] = load_row(gradient.depth, tile, camera, row);
-    gs[row] = load_row(gradient.silhouette, tile, camera, row);
-    Q[row] = gr[row] * load_row(drawn.rgb, tile, camera, row) + gg[row] * load_row(drawn.rgb + plane, tile, camera, row) +
-             gb[row] * load_row(drawn.rgb + 2 * plane, tile, camera, row) +
-             gd[row] * load_row(drawn.depth, tile, camera, row) + gs[row] * load_row(drawn.silhouette, tile, camera, row);
+  Slopes slopes[kPairs];
+  for (int i = 0; i < kPairs; ++i) {
+    const auto rows = [&](const float* image) { return load_rows(image, tile, camera, 2 * i); };
+    Slopes& at = slopes[i];
+    at.T = first_transmittance(tile, camera, 2 * i);
+    at.r = rows(gradient.rgb), at.g = rows(gradient.rgb + plane), at.b = rows(gradient.rgb + 2 * plane);
+    at.depth = rows(gradient.depth), at.silhouette = rows(gradient.silhouette);
+    at.Q = at.r * rows(drawn.rgb) + at.g * rows(drawn.rgb + plane) + at.b * rows(drawn.rgb + 2 * plane) +
+           at.depth * rows(drawn.depth) + at.silhouette * rows(drawn.silhouette);
   }
-  for (std::size_t i = 0; i < tile.count; ++i) {
-    if (i % 8 == 7 && opaque(T)) break;
-    const Splat& s = splats[tile.splats[i]];
-    const Footprint f = footprint(s, tile);
-    Lanes sums[8] = {};  // as in SplatGradient
-    Lanes squared_dy{};
-    for (int row = 0; row < kTile; ++row) {
-      if (f.down[row] < kMinAlpha) continue;
-      const Lanes raw = f.down[row] * f.across;
-      const Lanes alpha = min(raw, splat(kMaxAlpha));
-      const IntLanes blended = (alpha >= kMinAlpha) & (T[row] >= kMinTransmittance);
-      const Lanes w = keep(blended, alpha * T[row]);
-      const Lanes q = gr[row] * s.r + gg[row] * s.g + gb[row] * s.b + gd[row] * s.z + gs[row];
-      Q[row] -= w * q;
-      const Lanes slope = keep(blended & (raw <= kMaxAlpha), alpha * (T[row] * q - Q[row] / (1.0f - alpha)));
-      const Lanes slope_dy = slope * f.dy[row];
-      sums[0] += slope;
-      sums[2] += slope_dy;
-      squared_dy += slope_dy * f.dy[row];
-      if (kMap) {
-        sums[4] += w * gr[row];
-        sums[5] += w * gg[row];
-        sums[6] += w * gb[row];
-      }
-      sums[7] += w * gd[row];
-      T[row] -= w;
-    }
-    sums[1] = sums[0] * f.dx;
-    sums[3] = sums[1] * f.dx + squared_dy;
-    float* into = &gradients[tile.splats[i]].log_alpha;
-    store(into, load(into) + row_sums(sums));
+  for (std::size_t k = 0; k < tile.count; ++k) {
+    if (k % 8 == 7 && opaque(slopes)) break;
+    const Splat& s = splats[tile.splats[k]];
+    descend<kMap>(slopes, s, footprint(s, tile), gradients[tile.splats[k]]);
   }
 }
 
@@ -234,100 +265,77 @@ static inline Lanes load_bytes(const std::uint8_t* pixels, int columns, int chan
   return values * (1.0f / 255.0f);
 }
 
-static inline Lanes sign(Lanes x) { return x > 0.0f ? splat(1.0f) : x < 0.0f ? splat(-1.0f) : Lanes{}; }
-
-struct RowGradient {
-  Lanes r, g, b, depth;
+// Huber's loss of one row, its gradient, and what the gradient sums to over the row's splats (Q of descend()).
+struct Comparison {
+  Lanes r, g, b, depth, Q;
+  double loss;
 };
 
-// L1 of one row, its gradient, and what the gradient sums to over the row's splats (Q of backward_tile).
-static inline double compare(const Row& drawn, const TileList& tile, const Camera& camera, int row, const Target& target,
-                             RowGradient& gradient, Lanes& Q) {
-  gradient = RowGradient{};
-  Q = Lanes{};
-  if (tile.y + row >= camera.height) return 0.0;
+// Slope of Huber's loss: that of a parabola up to the limit, one beyond.
+static inline Lanes slope_of(Lanes residual, float limit) {
+  const Lanes slope = residual * (1.0f / limit);
+  return max(min(slope, splat(1.0f)), splat(-1.0f));
+}
+
+static inline Lanes loss_of(Lanes residual, Lanes slope, float limit) {
+  return slope * (residual - 0.5f * limit * slope);
+}
+
+static inline Comparison compare(Lanes r, Lanes g, Lanes b, Lanes depth, const TileList& tile, const Camera& camera,
+                                 int row, const Target& target) {
+  Comparison result{};
+  if (tile.y + row >= camera.height) return result;
   const int columns = camera.width - tile.x < 8 ? camera.width - tile.x : 8;
   const std::size_t at = std::size_t(tile.y + row) * camera.width + tile.x;
   const IntLanes real = iota() < float(columns);
-  Lanes depth{};
-  __builtin_memcpy(&depth, target.depth + at, sizeof(float) * columns);
-  const Lanes red = keep(real, drawn.r - load_bytes(target.rgb + 3 * at, columns, 0));
-  const Lanes green = keep(real, drawn.g - load_bytes(target.rgb + 3 * at, columns, 1));
-  const Lanes blue = keep(real, drawn.b - load_bytes(target.rgb + 3 * at, columns, 2));
-  const Lanes range = keep(real & (depth > 0.0f), drawn.depth - depth);
-  gradient.r = target.color_weight * sign(red);
-  gradient.g = target.color_weight * sign(green);
-  gradient.b = target.color_weight * sign(blue);
-  gradient.depth = target.depth_weight * sign(range);
-  Q = gradient.r * drawn.r + gradient.g * drawn.g + gradient.b * drawn.b + gradient.depth * drawn.depth;
-  const Lanes loss = gradient.r * red + gradient.g * green + gradient.b * blue + gradient.depth * range;
-  double total = 0.0;
-  for (int i = 0; i < 8; ++i) total += loss[i];
-  return total;
+  Lanes reading{};
+  __builtin_memcpy(&reading, target.depth + at, sizeof(float) * columns);
+  const std::uint8_t* colors = target.rgb + 3 * at;
+  const Lanes red = keep(real, r - load_bytes(colors, columns, 0)), by_r = slope_of(red, target.color_limit);
+  const Lanes green = keep(real, g - load_bytes(colors, columns, 1)), by_g = slope_of(green, target.color_limit);
+  const Lanes blue = keep(real, b - load_bytes(colors, columns, 2)), by_b = slope_of(blue, target.color_limit);
+  const Lanes range = keep(real & (reading > 0.0f), depth - reading), by_range = slope_of(range, target.depth_limit);
+  const Lanes loss = target.color_weight * (loss_of(red, by_r, target.color_limit) + loss_of(green, by_g, target.color_limit) +
+                                            loss_of(blue, by_b, target.color_limit)) +
+                     target.depth_weight * loss_of(range, by_range, target.depth_limit);
+  for (int i = 0; i < 8; ++i) result.loss += loss[i];
+  result.r = target.color_weight * by_r, result.g = target.color_weight * by_g, result.b = target.color_weight * by_b;
+  result.depth = target.depth_weight * by_range;
+  result.Q = result.r * r + result.g * g + result.b * b + result.depth * depth;
+  return result;
+}
+
+// Both rows of a pair against the target. Returns their loss.
+static inline double start(Slopes& slopes, const Pixels& drawn, const TileList& tile, const Camera& camera, int row,
+                           const Target& target) {
+  const Comparison a = compare(upper(drawn.r), upper(drawn.g), upper(drawn.b), upper(drawn.depth), tile, camera, row, target);
+  const Comparison b = compare(lower(drawn.r), lower(drawn.g), lower(drawn.b), lower(drawn.depth), tile, camera, row + 1, target);
+  slopes = {first_transmittance(tile, camera, row), pair(a.Q, b.Q), pair(a.r, b.r), pair(a.g, b.g), pair(a.b, b.b),
+            pair(a.depth, b.depth), Pair{}};
+  return a.loss + b.loss;
 }
 
 static double fit(const TileList& tile, const Splat* splats, const Camera& camera, const Target& target, float* scratch,
                   SplatGradient* gradients) {
-  constexpr std::size_t kBatch = 16;
   Footprint* prints = reinterpret_cast<Footprint*>(scratch);
-  Row rows[kTile] = {};
-  for (int row = 0; row < kTile; ++row) rows[row].T = keep(on_image(tile, camera, row), splat(1.0f));
+  Pixels pixels[kPairs];
+  start(pixels, tile, camera);
   Splat batch[kBatch];
   std::size_t count = 0;
-  while (count < tile.count && !opaque(rows)) {
+  while (count < tile.count && !opaque(pixels)) {
     const std::size_t size = tile.count - count < kBatch ? tile.count - count : kBatch;
-    for (std::size_t i = 0; i < size; ++i) {
-      batch[i] = splats[tile.splats[count + i]];
-      prints[count + i] = footprint(batch[i], tile);
+    for (std::size_t k = 0; k < size; ++k) {
+      batch[k] = splats[tile.splats[count + k]];
+      prints[count + k] = footprint(batch[k], tile);
     }
-    for (int row = 0; row < kTile; row += 2) {
-      Row upper = rows[row], lower = rows[row + 1];
-      for (std::size_t i = 0; i < size; ++i) {
-        const Footprint& f = prints[count + i];
-        if ((f.down[row] < kMinAlpha) & (f.down[row + 1] < kMinAlpha)) continue;
-        blend(upper, f.down[row] * f.across, batch[i]);
-        blend(lower, f.down[row + 1] * f.across, batch[i]);
-      }
-      rows[row] = upper;
-      rows[row + 1] = lower;
-    }
+    blend(pixels, batch, prints + count, size);
     count += size;
   }
   double loss = 0.0;
-  Lanes T[kTile], Q[kTile];
-  RowGradient gradient[kTile];
-  for (int row = 0; row < kTile; ++row) loss += compare(rows[row], tile, camera, row, target, gradient[row], Q[row]);
-  start_transmittance(T, tile, camera);
-  for (std::size_t k = 0; k < count; ++k) {
-    const Splat& s = splats[tile.splats[k]];
-    const Footprint& f = prints[k];
-    Lanes sums[8] = {};  // as in SplatGradient
-    Lanes squared_dy{};
-    for (int row = 0; row < kTile; ++row) {
-      if (f.down[row] < kMinAlpha) continue;
-      const RowGradient& g = gradient[row];
-      const Lanes raw = f.down[row] * f.across;
-      const Lanes alpha = min(raw, splat(kMaxAlpha));
-      const IntLanes blended = (alpha >= kMinAlpha) & (T[row] >= kMinTransmittance);
-      const Lanes w = keep(blended, alpha * T[row]);
-      const Lanes q = g.r * s.r + g.g * s.g + g.b * s.b + g.depth * s.z;
-      Q[row] -= w * q;
-      const Lanes slope = keep(blended & (raw <= kMaxAlpha), alpha * (T[row] * q - Q[row] / (1.0f - alpha)));
-      const Lanes slope_dy = slope * f.dy[row];
-      sums[0] += slope;
-      sums[2] += slope_dy;
-      squared_dy += slope_dy * f.dy[row];
-      sums[4] += w * g.r;
-      sums[5] += w * g.g;
-      sums[6] += w * g.b;
-      sums[7] += w * g.depth;
-      T[row] -= w;
-    }
-    sums[1] = sums[0] * f.dx;
-    sums[3] = sums[1] * f.dx + squared_dy;
-    float* into = &gradients[tile.splats[k]].log_alpha;
-    store(into, load(into) + row_sums(sums));
-  }
+  Slopes slopes[kPairs];
+  for (int i = 0; i < kPairs; ++i) loss += start(slopes[i], pixels[i], tile, camera, 2 * i, target);
+  for (std::size_t k = 0; k < count; ++k)
+    descend<true>(slopes, splats[tile.splats[k]], prints[k], gradients[tile.splats[k]]);
   return loss;
 }
 

@@ -9,6 +9,7 @@
 #endif
 namespace splatam {
 namespace avx2 {
+#define SPLATAM_PAIRED 0
 #include "lanes.inl"
 #include "align.inl"
 #include "kernels.inl"

@@ -9,6 +9,7 @@
 #endif
 namespace splatam {
 namespace avx512 {
+#define SPLATAM_PAIRED 1
 #include "lanes.inl"
 #include "align.inl"
 #include "kernels.inl"

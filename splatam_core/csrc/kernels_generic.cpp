@@ -2,6 +2,7 @@
 
 namespace splatam {
 namespace generic {
+#define SPLATAM_PAIRED 0
 #include "lanes.inl"
 #include "align.inl"
 #include "kernels.inl"

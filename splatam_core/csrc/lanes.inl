@@ -47,6 +47,76 @@ static inline Lanes log_bound(Lanes x) {
 
 static inline Lanes keep(IntLanes mask, Lanes a) { return mask ? a : Lanes{}; }
 
+// Two rows of eight, the upper one first: one register where the processor has such, else two.
+#if SPLATAM_PAIRED
+typedef float Pair __attribute__((vector_size(64)));
+typedef std::int32_t IntPair __attribute__((vector_size(64)));
+
+static inline Pair pair(Lanes upper, Lanes lower) {
+  return __builtin_shufflevector(upper, lower, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+}
+
+static inline Lanes upper(Pair rows) { return __builtin_shufflevector(rows, rows, 0, 1, 2, 3, 4, 5, 6, 7); }
+
+static inline Lanes lower(Pair rows) { return __builtin_shufflevector(rows, rows, 8, 9, 10, 11, 12, 13, 14, 15); }
+
+static inline Pair min(Pair a, float b) { return a < b ? a : Pair{} + b; }
+
+static inline Pair either(IntPair mask, Pair a, Pair b) { return mask ? a : b; }
+
+static inline bool any(IntPair mask) {
+  std::int32_t bits = 0;
+  for (int i = 0; i < 16; ++i) bits |= mask[i];
+  return bits != 0;
+}
+#else
+struct Pair {
+  Lanes upper, lower;
+};
+
+struct IntPair {
+  IntLanes upper, lower;
+};
+
+static inline Pair pair(Lanes upper, Lanes lower) { return {upper, lower}; }
+
+static inline Lanes upper(Pair rows) { return rows.upper; }
+
+static inline Lanes lower(Pair rows) { return rows.lower; }
+
+static inline Pair operator+(Pair a, Pair b) { return {a.upper + b.upper, a.lower + b.lower}; }
+static inline Pair operator-(Pair a, Pair b) { return {a.upper - b.upper, a.lower - b.lower}; }
+static inline Pair operator*(Pair a, Pair b) { return {a.upper * b.upper, a.lower * b.lower}; }
+static inline Pair operator/(Pair a, Pair b) { return {a.upper / b.upper, a.lower / b.lower}; }
+static inline Pair operator+(Pair a, float b) { return {a.upper + b, a.lower + b}; }
+static inline Pair operator-(float a, Pair b) { return {a - b.upper, a - b.lower}; }
+static inline Pair operator*(Pair a, float b) { return {a.upper * b, a.lower * b}; }
+static inline Pair& operator+=(Pair& a, Pair b) { return a = a + b; }
+static inline Pair& operator-=(Pair& a, Pair b) { return a = a - b; }
+static inline Pair& operator*=(Pair& a, Pair b) { return a = a * b; }
+static inline IntPair operator>=(Pair a, float b) { return {a.upper >= b, a.lower >= b}; }
+static inline IntPair operator<=(Pair a, float b) { return {a.upper <= b, a.lower <= b}; }
+static inline IntPair operator&(IntPair a, IntPair b) { return {a.upper & b.upper, a.lower & b.lower}; }
+static inline IntPair& operator|=(IntPair& a, IntPair b) { return a = {a.upper | b.upper, a.lower | b.lower}; }
+
+static inline Pair min(Pair a, float b) { return {min(a.upper, splat(b)), min(a.lower, splat(b))}; }
+
+static inline Pair either(IntPair mask, Pair a, Pair b) {
+  return {mask.upper ? a.upper : b.upper, mask.lower ? a.lower : b.lower};
+}
+
+static inline bool any(IntPair mask) {
+  const IntLanes both = mask.upper | mask.lower;
+  std::int32_t bits = 0;
+  for (int i = 0; i < 8; ++i) bits |= both[i];
+  return bits != 0;
+}
+#endif
+
+static inline Pair pair(float upper, float lower) { return pair(splat(upper), splat(lower)); }
+
+static inline Pair keep(IntPair mask, Pair a) { return either(mask, a, Pair{}); }
+
 static inline Lanes sqrt(Lanes x) {
   Lanes root;
   for (int i = 0; i < 8; ++i) root[i] = __builtin_sqrtf(x[i]);

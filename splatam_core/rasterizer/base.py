@@ -33,6 +33,8 @@ MIN_ALPHA = 1.0 / 255.0
 MIN_TRANSMITTANCE = 1e-4
 BLOCK = 1024
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
+COLOR_LIMIT, DEPTH_LIMIT_M = 0.1, 0.02
+"""Of ``fit``: up to here a residual counts by its square (over twice the limit), beyond by its size (Huber)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,7 +138,7 @@ class Target:
         rgb8: [H, W, 3] uint8.
         depth: [H, W] metres, 0 = no reading.
         T_cam_world: [4, 4] float32.
-        color_weight: of the mean absolute difference of colour, over pixels and channels.
+        color_weight: of the mean difference of colour (Huber), over pixels and channels.
         depth_weight: of that of depth_acc, over readings.
     """
 

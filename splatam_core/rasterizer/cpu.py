@@ -12,7 +12,16 @@ from torch import Tensor
 
 from splatam_core.camera import PinholeCamera
 from splatam_core.errors import RasterizerError
-from splatam_core.rasterizer.base import Gaussians, Moments, Rates, Render, Target, check_isotropic
+from splatam_core.rasterizer.base import (
+    COLOR_LIMIT,
+    DEPTH_LIMIT_M,
+    Gaussians,
+    Moments,
+    Rates,
+    Render,
+    Target,
+    check_isotropic,
+)
 from splatam_core.rasterizer.ewa import Ellipses, project
 
 try:
@@ -69,6 +78,7 @@ class CpuRasterizer:
             (rates.means, rates.log_scales, rates.logit_opacities, rates.rgb), target.T_cam_world.numpy(),
             camera.fx, camera.fy, camera.cx, camera.cy, target.rgb8.numpy(), target.depth.numpy(),
             target.color_weight / (3 * camera.width * camera.height), target.depth_weight / readings,
+            COLOR_LIMIT, DEPTH_LIMIT_M,
         )  # fmt: skip
 
 

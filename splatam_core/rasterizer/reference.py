@@ -10,6 +10,8 @@ from splatam_core.rasterizer.base import (
     BETA_1,
     BETA_2,
     BLUR_PX2,
+    COLOR_LIMIT,
+    DEPTH_LIMIT_M,
     EPSILON,
     MAX_ALPHA,
     MIN_ALPHA,
@@ -51,7 +53,7 @@ class ReferenceRasterizer:
         values = [gaussians.means, gaussians.log_scales, gaussians.logit_opacities[:, None], gaussians.rgb]
         packed = torch.cat(values, dim=1).detach().requires_grad_()  # [N, 8]
         means, log_scales, logits, rgb = packed.split([3, 1, 1, 3], dim=1)
-        loss = _l1(self.render(Gaussians(means, log_scales, logits[:, 0], rgb), target.camera, target.T_cam_world), target)
+        loss = _loss(self.render(Gaussians(means, log_scales, logits[:, 0], rgb), target.camera, target.T_cam_world), target)
         (gradient,) = torch.autograd.grad(loss, packed)
         seen = (gradient != 0).any(dim=1)
         gradient = gradient[seen]
@@ -67,11 +69,16 @@ class ReferenceRasterizer:
         return loss.item()
 
 
-def _l1(render: Render, target: Target) -> Tensor:
-    color = (render.rgb - target.rgb8.permute(2, 0, 1) / 255).abs().mean()
+def _loss(render: Render, target: Target) -> Tensor:
+    color = _huber(render.rgb - target.rgb8.permute(2, 0, 1) / 255, COLOR_LIMIT).mean()
     read = target.depth > 0
-    depth = ((render.depth_acc - target.depth).abs() * read).sum() / read.sum().clamp(min=1)
+    depth = (_huber(render.depth_acc - target.depth, DEPTH_LIMIT_M) * read).sum() / read.sum().clamp(min=1)
     return target.color_weight * color + target.depth_weight * depth
+
+
+def _huber(residual: Tensor, limit: float) -> Tensor:
+    size = residual.abs()
+    return torch.where(size <= limit, residual**2 / (2 * limit), size - limit / 2)
 
 
 def _circles(gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -> Ellipses:

@@ -128,7 +128,7 @@ def _fitted(
 
 @pytest.mark.parametrize(('name', 'backend', 'threads'), _cases(FITTED))
 def test_fitting_steps_equal_the_reference(name: str, backend: str, threads: int) -> None:
-    """Five steps of rendering, L1 and Adam in native code, against the same written with autograd."""
+    """Five steps of rendering, Huber's loss and Adam in native code, against the same written with autograd."""
     expected, expected_moments, expected_losses = _fitted(ReferenceRasterizer(), SCENES[name], 5)
     actual, moments, losses = _fitted(make_rasterizer(backend, threads), SCENES[name], 5, scenes.device_of(backend))
     assert losses == pytest.approx(expected_losses, rel=1e-5, abs=1e-7)  # float32 sums over the image
