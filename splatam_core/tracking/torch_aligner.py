@@ -83,9 +83,11 @@ class TorchAligner:
         residuals = torch.stack([value[0] - (gain * light + bias), (value[1] - moved.z[1]) * moved.inverse_z[1]])
         compared = moved.inside[1] & ~value[1].isnan()
         seen = moved.inside.all(dim=0) & (residuals[1].abs() < max_depth_ratio)  # NaN is not
-        residuals = torch.where(seen, residuals, 0)
+        tilt = torch.stack([along_u[1] * fx, along_v[1] * fy]) * moved.inverse_z[1]  # [2, P]
+        upright = 1 / (1 + (tilt * tilt).sum(dim=0)).sqrt()  # of depth: off along the surface's normal, not along the ray
+        residuals = torch.where(seen, torch.stack([residuals[0], residuals[1] * upright]), 0)
         agree = seen & (residuals[0].abs() <= inlier_light) & (residuals[1].abs() <= inlier_depth)
-        slopes = _slopes(moved, along_u * fx, along_v * fy, light, speed)
+        slopes = _slopes(moved, along_u * fx, along_v * fy, upright, light, speed)
         counts = torch.stack([known, compared, seen, agree]).sum(dim=1)
         return _collected(torch.where(seen, slopes, 0), residuals, scales, counts, _medians(residuals, seen))
 
@@ -144,7 +146,9 @@ def _sampled(layers: Tensor, moved: _Moved) -> Tensor:
     return upper * (1 - below) + lower * below
 
 
-def _slopes(moved: _Moved, along_u: Tensor, along_v: Tensor, light: Tensor, speed: Tensor) -> Tensor:
+def _slopes(
+    moved: _Moved, along_u: Tensor, along_v: Tensor, upright: Tensor, light: Tensor, speed: Tensor
+) -> Tensor:
     """[9, 2, P] change of the residuals with the unknowns; along_u and along_v are those of the frame, times focal length."""
     x, y, z = moved.x, moved.y, moved.z
     a, b = along_u * moved.inverse_z, along_v * moved.inverse_z
@@ -153,7 +157,7 @@ def _slopes(moved: _Moved, along_u: Tensor, along_v: Tensor, light: Tensor, spee
     by_twist[2, 1] -= 1
     by_twist[3, 1] -= y[1]
     by_twist[4, 1] += x[1]
-    by_twist[:, 1] *= moved.inverse_z[1]
+    by_twist[:, 1] *= moved.inverse_z[1] * upright
     others = torch.stack([-light, torch.full_like(light, -1), speed @ by_twist[:, 0]])  # of light only
     return torch.cat([by_twist, torch.stack([others, torch.zeros_like(others)], dim=1)])
 

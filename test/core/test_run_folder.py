@@ -83,7 +83,8 @@ def test_run_json_says_what_ran_where(tmp_path: Path) -> None:
     information = json.loads((tmp_path / 'run.json').read_text())
     assert information['program'] == 'splatam run' and information['source']['path'] == '/data/room'
     assert information['camera'] is None  # no frame yet
-    assert {'system', 'processor', 'cores', 'memory_mb'} == information['machine'].keys()
+    assert {'system', 'processor', 'cores', 'memory_mb', 'gpu'} == information['machine'].keys()
+    assert 'rasterizer' in information['backend']
     assert information['versions']['torch'] and information['versions']['python']
     assert information['commit'] == environment.commit()
     assert re.fullmatch(r'\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00', information['started'])
