@@ -125,6 +125,19 @@ class Session:
                           f'{metrics.num_gaussians} Gaussians in {path}')  # fmt: skip
         return metrics
 
+    def finish(self, slam: Slam) -> None:
+        """Save at the end; where no frame ever came leave the folder empty, for the next attempt.
+
+        Raises:
+            SplatamError, OSError: as ``save``.
+        """
+        folder = self._folder
+        if folder is None or not folder.is_empty or folder.has_previous:
+            self.save(slam)
+            return
+        folder.discard()
+        self._logger.info(f'no frame came, so nothing is saved in {folder.path}')
+
     def load(self, slam: Slam) -> str:
         """Go on in the map at ``load_path``, from ``load_pose``. What there is to say.
 
