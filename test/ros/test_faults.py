@@ -213,7 +213,8 @@ def test_a_disk_that_is_full(graph: Graph, frames: SyntheticSequence) -> None:
     before = (out / 'map.ply').read_bytes()
     assert live.show(still(frames, 1))
     limit_file_size(live.node, 50)  # not even a line of the trajectory
-    assert 'File too large' in control.fail('save_map')
+    why = control.fail('save_map')
+    assert f'{out}: cannot be saved: File too large' in why and '\n' not in why
     assert all(live.show(still(frames, number)) for number in range(2, 6))
     assert len(read_run(out).trajectory) == 2
     assert (out / 'map.ply').read_bytes() == before and read_ply(out / 'map.ply').means.any()
