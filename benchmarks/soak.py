@@ -105,6 +105,8 @@ def main() -> None:
     parser.add_argument('--max-frames', type=int, default=150)
     parser.add_argument('--rate', type=float, default=1.0, help='of playback')
     args = parser.parse_args()
+    title = f'{Path(args.source).name}, {args.minutes:g} minutes of looping, preset `{args.preset}`'
+    print_header(f'{title}, {args.width} pixels wide, rate {args.rate:g}', 1)
     period_s = min(5.0, args.minutes * 60 / 20)
     with tempfile.TemporaryDirectory() as scratch:
         convert(args.source, bag := Path(scratch) / 'bag', args.width, args.max_frames)
@@ -113,8 +115,6 @@ def main() -> None:
             player = opened.start_player(bag, '--loop', '--rate', str(args.rate))
             samples = watch(opened, node, player, args.minutes, period_s)
             warnings = [line for line in node.log.read_text().splitlines() if '[WARN]' in line or '[ERROR]' in line]
-    title = f'{Path(args.source).name}, {args.minutes:g} minutes of looping, preset `{args.preset}`'
-    print_header(f'{title}, {args.width} pixels wide, rate {args.rate:g}', 1)
     print_table(samples, rows=16)
     print(f'\nThe node warned {len(warnings)} times' + (f', last: {warnings[-1]}' if warnings else '.'))
 
