@@ -1,10 +1,10 @@
 """The node for a long time: a recording is played over and over, and its memory is watched.
 
-    python benchmarks/soak.py [SOURCE] [--minutes 30] [--preset quick] [--width 320] [--max-frames 150] [--rate 1]
+    python benchmarks/soak.py [SOURCE] [--minutes 30] [--preset quick] [--width 320] [--rate 1] [--max-frames 150]
 
-The player loops, stamps included, so that the map starts anew with each loop; the node drops what it has no time for, as
-beside a camera. Every output of the node is listened to, and the run is saved at each loop. Frames in are counted by
-their CameraInfo, frames out by ``~/processed``.
+The player loops, stamps included, so that the map starts anew with each loop; the node drops what it has no time for,
+as beside a camera. Every output of the node is listened to, and the run is saved at each loop. Frames in are counted
+by their CameraInfo, frames out by ``~/processed``.
 """
 
 from __future__ import annotations

@@ -115,8 +115,10 @@ class SplatamNode(Node):
         odometry = [self._geometry.odometry.input] if self._geometry.odometry else []
         topics = [item.topic for item in (*self._inputs, *odometry)]
         for name in unused_overrides(self, topics):
-            self.get_logger().warning(f"parameter '{name}' overrides nothing; expected qos_overrides.TOPIC.subscription."
-                                      f'POLICY, TOPIC one of {", ".join(topics)}')  # fmt: skip
+            self.get_logger().warning(
+                f"parameter '{name}' overrides nothing; expected qos_overrides.TOPIC.subscription.POLICY, "
+                f'TOPIC one of {", ".join(topics)}'
+            )
 
     # --- executor thread ---
 

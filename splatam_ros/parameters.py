@@ -59,7 +59,7 @@ NODE_SETTINGS: tuple[Setting, ...] = (
              choices=('raw', 'compressed')),
     _setting('depth_transport', 'raw', 'What depth/image carries; compressedDepth: depth/image/compressedDepth.',
              choices=('raw', 'compressedDepth')),
-    _setting('depth_scale', 0.001, 'What a count of 16-bit depth is; drivers send millimetres, some recordings not.', 'm',
+    _setting('depth_scale', 0.001, 'A count of 16-bit depth; drivers send millimetres, some recordings others.', 'm',
              1e-6, 1.0),
     _setting('undistort', True, 'Undistort images by K and D; off = they are rectified (image_rect) to camera P.'),
     _setting('sync.mode', 'approximate', 'Pair colour and depth of equal, or of nearby stamps.',

@@ -308,7 +308,8 @@ def test_what_was_recorded_of_the_node_plays_back(
     with Writer(copy, version=9) as writer:
         for topic, messages in heard.items():
             offered = recorded_qos(infos[topic].qos_profile)
-            added = writer.add_connection(topic, infos[topic].topic_type, typestore=store, offered_qos_profiles=[offered])
+            type_name = infos[topic].topic_type
+            added = writer.add_connection(topic, type_name, typestore=store, offered_qos_profiles=[offered])
             for number, data in enumerate(messages):
                 writer.write(added, 10**9 + number * 10**8, data)
     with Reader(copy) as reader:
