@@ -60,6 +60,7 @@ def test_recording_in_poses_renders_cloud_and_folder_out(
     node = run_node(
         graph, save_path=out, queue_policy='all', exit_on_publisher_end=True,
         publish_rate__path=0.0, publish_rate__cloud=0.0, max_cloud_points=500,
+        no_data_timeout=60.0,  # a busy machine takes its time until the first frame, and no warning is expected
     )  # fmt: skip
     received = {
         topic: graph.collect(message_class, f'/splatam/{topic}', qos)
