@@ -143,12 +143,8 @@ class Live:
 
     def pose_of(self, stamp_ns: int) -> PoseStamped | None:
         """Its pose is published before the frame is said to be done, on another topic."""
-
-        def found() -> PoseStamped | None:
-            return next((pose for pose in reversed(self.poses) if stamps.message_stamp_ns(pose) == stamp_ns), None)
-
-        self.graph.spin_for(0.1, unless=found)
-        return found()
+        self.graph.spin_for(0.1)
+        return next((pose for pose in reversed(self.poses) if stamps.message_stamp_ns(pose) == stamp_ns), None)
 
 
 def position(pose: PoseStamped) -> NDArray[np.float64]:

@@ -167,10 +167,10 @@ class Graph:
             assert time.monotonic() < deadline_s, f'not so within {timeout_s} s. {explain()}'
             self._executor.spin_once(timeout_sec=0.05)
 
-    def spin_for(self, seconds: float, unless: Callable[[], object] = lambda: False) -> None:
-        """For what must not happen, or need not: there is no event to wait for."""
+    def spin_for(self, seconds: float) -> None:
+        """For what must not happen: there is no event to wait for."""
         deadline_s = time.monotonic() + seconds
-        while time.monotonic() < deadline_s and not unless():
+        while time.monotonic() < deadline_s:
             self._executor.spin_once(timeout_sec=0.05)
 
     def collect(self, message_class: type, topic: str, qos: QoSProfile = RELIABLE, raw: bool = False) -> list[Any]:
