@@ -128,6 +128,10 @@ class Graph:
         self.node.create_subscription(message_class, topic, receive, RELIABLE, raw=True)
         return arrivals
 
+    def drain(self, topic: str, message_class: type) -> None:
+        """Subscribe, so that somebody listens, and keep nothing."""
+        self.node.create_subscription(message_class, topic, lambda data: None, RELIABLE, raw=True)
+
     def spin_until(self, condition: Callable[[], object], timeout_s: float) -> bool:
         """Take messages until a condition is met. Whether it was in time."""
         deadline_s = time.monotonic() + timeout_s

@@ -1,9 +1,10 @@
 """The node for a long time: a recording is played over and over, and its memory is watched.
 
-    python benchmarks/soak.py [SOURCE] [--minutes 30] [--preset quick] [--width 320] [--max-frames 150]
+    python benchmarks/soak.py [SOURCE] [--minutes 30] [--preset quick] [--width 320] [--rate 1] [--max-frames 150]
 
-The player loops, stamps included, at rate 1; the node drops what it has no time for, as beside a camera. Frames in are
-counted by their CameraInfo, frames out by ``~/processed``.
+The player loops, stamps included, so that the map starts anew with each loop; the node drops what it has no time for,
+as beside a camera. Every output of the node is listened to, and the run is saved at each loop. Frames in are counted
+by their CameraInfo, frames out by ``~/processed``.
 """
 
 from __future__ import annotations
@@ -20,6 +21,9 @@ from header import print_header
 from live import Child, Graph, convert, graph
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
+
+from splatam_ros.outputs import OUTPUTS
+from splatam_ros.recording import message_class
 
 START_TIMEOUT_S = 60.0
 SETTLING = 0.25  # share of the time that memory may grow: caches, allocators, the first map
@@ -55,6 +59,8 @@ def watch(opened: Graph, node: Child, player: Child, minutes: float, period_s: f
     infos = opened.listen('/rgb/camera_info', CameraInfo)
     done = opened.listen('/splatam/processed', Header)
     poses = opened.listen('/splatam/pose')
+    for output in OUTPUTS[1:]:
+        opened.drain(f'/splatam/{output.topic}', message_class(output.type_name))
     if not opened.spin_until(lambda: done, START_TIMEOUT_S):
         sys.exit(f'no frame came out; the node said:\n{node.log.read_text()}')
     samples: list[Sample] = []
@@ -97,17 +103,18 @@ def main() -> None:
     parser.add_argument('--preset', default='quick')
     parser.add_argument('--width', type=int, default=320)
     parser.add_argument('--max-frames', type=int, default=150)
+    parser.add_argument('--rate', type=float, default=1.0, help='of playback')
     args = parser.parse_args()
+    title = f'{Path(args.source).name}, {args.minutes:g} minutes of looping, preset `{args.preset}`'
+    print_header(f'{title}, {args.width} pixels wide, rate {args.rate:g}', 1)
     period_s = min(5.0, args.minutes * 60 / 20)
     with tempfile.TemporaryDirectory() as scratch:
         convert(args.source, bag := Path(scratch) / 'bag', args.width, args.max_frames)
         with graph(Path(scratch) / 'logs') as opened:
-            node = opened.start_node(args.preset)
-            player = opened.start_player(bag, '--loop')
+            node = opened.start_node(args.preset, save_path=Path(scratch) / 'run')
+            player = opened.start_player(bag, '--loop', '--rate', str(args.rate))
             samples = watch(opened, node, player, args.minutes, period_s)
             warnings = [line for line in node.log.read_text().splitlines() if '[WARN]' in line or '[ERROR]' in line]
-    title = f'{Path(args.source).name}, {args.minutes:g} minutes of looping, preset `{args.preset}`'
-    print_header(f'{title}, {args.width} pixels wide', 1)
     print_table(samples, rows=16)
     print(f'\nThe node warned {len(warnings)} times' + (f', last: {warnings[-1]}' if warnings else '.'))
 

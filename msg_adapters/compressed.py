@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters import stamps
-from msg_adapters.encodings import Depth, Rgb, clean_metres, metres_from_millimetres
+from msg_adapters.encodings import Depth, Rgb, clean_metres, metres_from_counts
 from msg_adapters.errors import MessageError
 from msg_adapters.factory import MessageFactory
 from msg_adapters.pixels import checked_depth, checked_rgb, millimetres
@@ -36,15 +36,19 @@ def decode_color(message: Any) -> Rgb:
     return cv2.cvtColor(_decoded(bytes(message.data), cv2.IMREAD_COLOR, message.format), cv2.COLOR_BGR2RGB)
 
 
-def decode_depth(message: Any) -> Depth:
+def decode_depth(message: Any, metres_per_count: float) -> Depth:
     """[H, W] metres of a PNG, 0 = no reading.
+
+    Args:
+        message: the image.
+        metres_per_count: the step of 16UC1 and mono16.
 
     Raises:
         MessageError: the message holds colour, another codec, or damaged data.
     """
     data, depth_format = bytes(message.data), message.format
     if 'compressedDepth' not in depth_format:
-        return metres_from_millimetres(_depth_counts(data, depth_format))
+        return metres_from_counts(metres_per_count, _depth_counts(data, depth_format))
     if len(data) < _CONFIG.size:
         raise MessageError(f"depth image with format '{depth_format}' has {len(data)} bytes; it is truncated")
     if 'rvl' in depth_format:
@@ -53,7 +57,7 @@ def decode_depth(message: Any) -> Depth:
     counts = _depth_counts(data[_CONFIG.size :], depth_format)
     encoding = depth_format.split(';')[0].strip()
     if encoding in ('16UC1', 'mono16'):
-        return metres_from_millimetres(counts)
+        return metres_from_counts(metres_per_count, counts)
     if encoding == '32FC1':
         return _metres_from_inverse(counts, a, b)
     raise MessageError(f"depth image has format '{depth_format}'; it must begin with 16UC1, mono16 or 32FC1")

@@ -16,6 +16,7 @@ from msg_adapters.errors import MessageError
 Rgb = NDArray[np.uint8]
 Depth = NDArray[np.float32]
 MILLIMETRES_PER_METRE = np.float32(1000)
+MILLIMETRE = 0.001
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +36,9 @@ class Encoding:
     width_multiple: int = 1
 
 
-def metres_from_millimetres(depth_mm: NDArray[np.uint16]) -> Depth:
-    """[H, W] metres of whole millimetres; 0 stays 0, no reading."""
-    return depth_mm.astype(np.float32) / MILLIMETRES_PER_METRE
+def metres_from_counts(metres_per_count: float, counts: NDArray[np.uint16]) -> Depth:
+    """[H, W] metres of whole steps of some length; 0 stays 0, no reading."""
+    return counts.astype(np.float32) / np.float32(1 / metres_per_count)  # 1000 and 5000 are exact, 0.001 is not
 
 
 def clean_metres(depth_m: NDArray[np.floating[Any]]) -> Depth:
@@ -74,11 +75,11 @@ COLOR: Mapping[str, Encoding] = {
     'yuyv': _color(2, cv2.COLOR_YUV2RGB_YUY2, width_multiple=2),
 }
 
-DEPTH: Mapping[str, Encoding] = {
-    '16UC1': Encoding('u2', 1, metres_from_millimetres),
-    'mono16': Encoding('u2', 1, metres_from_millimetres),
-    '32FC1': Encoding('f4', 1, clean_metres),
-}
+
+def depth_encodings(metres_per_count: float) -> Mapping[str, Encoding]:
+    """Those of depth; 16 bits are counts of some length, floats are metres."""
+    counts = Encoding('u2', 1, partial(metres_from_counts, metres_per_count))
+    return {'16UC1': counts, 'mono16': counts, '32FC1': Encoding('f4', 1, clean_metres)}
 
 
 def decode(message: Any, encodings: Mapping[str, Encoding], what: str) -> NDArray[Any]:

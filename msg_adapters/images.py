@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from msg_adapters import compressed, encodings, stamps
 from msg_adapters.compressed import compressed_color_message, compressed_depth_message
-from msg_adapters.encodings import Depth, Rgb
+from msg_adapters.encodings import MILLIMETRE, Depth, Rgb
 from msg_adapters.errors import MessageError
 from msg_adapters.factory import MessageFactory
 from msg_adapters.pixels import checked_depth, checked_mono, checked_rgb, millimetres
@@ -40,17 +40,19 @@ def decode_color(message: Any) -> Rgb:
     return compressed.decode_color(message)
 
 
-def decode_depth(message: Any) -> Depth:
+def decode_depth(message: Any, metres_per_count: float = MILLIMETRE) -> Depth:
     """[H, W] float32 metres, 0 = no reading, of an Image or CompressedImage; a copy, not a view of the message.
 
-    16UC1 and mono16 are millimetres, 32FC1 metres (REP 118).
+    Args:
+        message: the image.
+        metres_per_count: the step of 16UC1 and mono16; millimetres by REP 118. 32FC1 is metres in any case.
 
     Raises:
         MessageError: the encoding or format is not a supported depth one, or the data do not fit it.
     """
     if _is_raw(message):
-        return encodings.decode(message, encodings.DEPTH, 'depth')
-    return compressed.decode_depth(message)
+        return encodings.decode(message, encodings.depth_encodings(metres_per_count), 'depth')
+    return compressed.decode_depth(message, metres_per_count)
 
 
 def _is_raw(message: Any) -> bool:

@@ -193,6 +193,11 @@ class RunFolder:
         return not self._records
 
     @property
+    def has_previous(self) -> bool:
+        """Whether it holds a run of before a reset."""
+        return (self.path / PREVIOUS).exists()
+
+    @property
     def num_frames(self) -> int:
         """How many were written down."""
         return len(self._records)
@@ -285,6 +290,12 @@ class RunFolder:
         metrics = self.save(slam)
         self.close()
         return metrics
+
+    def discard(self) -> None:
+        """Close, and remove what was written of a run that had no frame; the folder stays, empty."""
+        self.close()
+        for name in FILES:
+            (self.path / name).unlink(missing_ok=True)
 
     def close(self) -> None:
         """Close the files; once closed nothing can be appended."""

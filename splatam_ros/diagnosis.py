@@ -58,7 +58,8 @@ def why_no_frames(node: Node, inputs: Sequence[Input], statistics: SyncStatistic
         options: the node's.
     """
     if unpublished := [item for item in inputs if item.num_publishers == 0]:
-        return f'no publisher on {_topics(unpublished)}; {_what_there_is(unpublished[0])}'
+        domain_id = node.context.get_domain_id()
+        return f'no publisher on {_topics(unpublished)}; {_what_there_is(unpublished[0], domain_id)}'
     if mistyped := [item for item in inputs if item.other_type]:
         item = mistyped[0]
         return f'{item.topic} carries {item.other_type}, expected {item.type_name}; remap, or set {_transport(item)}'
@@ -86,10 +87,13 @@ def why_no_frames(node: Node, inputs: Sequence[Input], statistics: SyncStatistic
     return 'nothing new comes, or nothing that can be used; warnings say what was left out'
 
 
-def _what_there_is(item: Input) -> str:
+def _what_there_is(item: Input, domain_id: int) -> str:
     found = item.candidates()
     if not found:
-        return f'nobody publishes {item.type_name}: is the camera or the recording running, in this ROS_DOMAIN_ID?'
+        return (
+            f'nobody publishes {item.type_name}: is the camera or the recording running, with this ROS_DOMAIN_ID, '
+            f'{domain_id}?'
+        )
     more = f' and {len(found) - NUM_SUGGESTIONS} more' if len(found) > NUM_SUGGESTIONS else ''
     return f'of that type there is {", ".join(found[:NUM_SUGGESTIONS])}{more}; remap: -r {item.name}:={found[0]}'
 

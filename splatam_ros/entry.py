@@ -6,6 +6,7 @@ import sys
 from importlib import import_module
 
 _EXIT_USAGE = 2
+_EXIT_INTERRUPTED = 130  # as shells say it: 128 + SIGINT
 
 
 def node() -> int:
@@ -30,4 +31,6 @@ def _main(module: str) -> int:
             file=sys.stderr,
         )
         return _EXIT_USAGE
+    except KeyboardInterrupt:  # loading takes seconds, and there is nothing to put in order yet
+        return _EXIT_INTERRUPTED
     return main()

@@ -4,20 +4,30 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from msg_adapters import stamps
+from splatam_ros.process import RosError
 
 DEPTH = 10
-QOS_OVERRIDE = 'qos_overrides.{}.subscription.{}'
+QOS_OVERRIDES = 'qos_overrides.'
+QOS_OVERRIDE = QOS_OVERRIDES + '{}.subscription.{}'
 OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY)
+CHOICES = {
+    policy: tuple(name.lower() for name in kind.__members__ if name != 'UNKNOWN')
+    for policy, kind in (
+        (QoSPolicyKind.HISTORY, HistoryPolicy), (QoSPolicyKind.RELIABILITY, ReliabilityPolicy),
+        (QoSPolicyKind.DURABILITY, DurabilityPolicy),
+    )
+}  # fmt: skip
+NOT_OURS = ('/clock', '/parameter_events')  # rclpy subscribes to them, with overrides of its own
 
 
 class Input:
@@ -48,6 +58,9 @@ class Input:
             on_message: called by the executor.
             reliability: auto, reliable or best_effort.
             keep_all: keep every message until it is taken, not just the newest.
+
+        Raises:
+            RosError: a parameter that overrides the QoS has a value that no policy has.
         """
         self.type_name = f'{message_class.__module__.split(".")[0]}/msg/{message_class.__name__}'
         self.incompatible_policy = ''
@@ -58,8 +71,8 @@ class Input:
         self._message_class = message_class
         self.name = topic
         self._on_message = on_message
-        override = QOS_OVERRIDE.format(node.resolve_topic_name(topic), 'reliability')
-        self._may_fall_back = reliability == 'auto' and not node.has_parameter(override)
+        overridden = _check_overrides(node, node.resolve_topic_name(topic))
+        self._may_fall_back = reliability == 'auto' and QoSPolicyKind.RELIABILITY not in overridden
         self._qos = QoSProfile(
             history=HistoryPolicy.KEEP_ALL if keep_all else HistoryPolicy.KEEP_LAST,
             depth=DEPTH,
@@ -118,3 +131,31 @@ class Input:
         qos = copy.copy(self._qos)  # with what was overridden
         qos.reliability = ReliabilityPolicy.BEST_EFFORT
         self._subscription = self._subscribe(qos, None)
+
+
+def _check_overrides(node: Node, topic: str) -> list[QoSPolicyKind]:
+    """The policies of a topic that parameters override."""
+    names = {policy: QOS_OVERRIDE.format(topic, policy.name.lower()) for policy in OVERRIDABLE}
+    overridden = [policy for policy, name in names.items() if node.has_parameter(name)]
+    for policy in overridden:
+        value = node.get_parameter(names[policy]).value
+        choices = CHOICES.get(policy)
+        if choices and value not in choices:
+            raise RosError(f"{names[policy]} = '{value}': expected one of {', '.join(choices)}")
+        if not choices and not (type(value) is int and value >= 1):
+            raise RosError(f'{names[policy]} = {value}: expected a whole number at least 1')
+    return overridden
+
+
+def unused_overrides(node: Node, topics: Sequence[str]) -> list[str]:
+    """Parameters that override a QoS of no topic of these, or no policy of it: misspelt, or not as remapped.
+
+    Args:
+        node: whose parameters.
+        topics: names on the graph.
+    """
+    used = {QOS_OVERRIDE.format(topic, policy.name.lower()) for topic in topics for policy in OVERRIDABLE}
+    given = [QOS_OVERRIDES + name for name in node.get_parameters_by_prefix(QOS_OVERRIDES.rstrip('.'))]
+    return sorted(
+        name for name in given if name not in used and not name.startswith(tuple(QOS_OVERRIDES + t for t in NOT_OURS))
+    )

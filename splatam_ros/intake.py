@@ -47,6 +47,7 @@ class Intake:
         )  # fmt: skip
         self._width = options.width or None
         self._is_rectified = not options.undistort
+        self._decode_depth = partial(images.decode_depth, metres_per_count=options.depth_scale)
         self._warnings = warnings
         self._gate = gate
         self._on_skipped = on_skipped
@@ -105,7 +106,7 @@ class Intake:
     def _frame(self, found: RgbdSet) -> RgbdFrame | None:
         factory = self._attempt('camera', self._frame_factory, found.info)
         rgb = self._attempt('colour', images.decode_color, found.color)
-        depth_m = self._attempt('depth', images.decode_depth, found.depth)
+        depth_m = self._attempt('depth', self._decode_depth, found.depth)
         if factory is None or rgb is None or depth_m is None:
             return None
         self.camera_frame = found.info.frame_id or found.color.header.frame_id

@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+import textwrap
 from collections.abc import Sequence
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
+from splatam_core.config import Setting
 from splatam_core.errors import SplatamError
 from splatam_ros.node import SplatamNode
 from splatam_ros.parameters import NODE_SETTINGS
@@ -18,6 +20,7 @@ from splatam_ros.process import StopRequest, ros, split_arguments
 PROGRAM = 'splatam_node'
 EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
 STEP_S = 0.1  # longest time until a signal is noticed
+HELP_COLUMNS, HELP_INDENT = 100, '      '
 
 
 class RosLog(logging.Handler):
@@ -61,8 +64,8 @@ def run(for_ros: Sequence[str], stop: StopRequest) -> int:
 def make_parser() -> argparse.ArgumentParser:
     """The parser of what is no ROS argument, which is nothing but ``--help``."""
     lines = [
-        f'  {setting.name} ({setting.default!r}{" " + setting.unit if setting.unit else ""})\n      {setting.help}'
-        + (f' One of {", ".join(setting.choices)}.' if setting.choices else '')
+        f'  {setting.name} ({setting.default!r}{" " + setting.unit if setting.unit else ""})\n'
+        + textwrap.fill(_help(setting), HELP_COLUMNS, initial_indent=HELP_INDENT, subsequent_indent=HELP_INDENT)
         for setting in NODE_SETTINGS
     ]
     return argparse.ArgumentParser(
@@ -72,6 +75,10 @@ def make_parser() -> argparse.ArgumentParser:
         epilog='parameters (default), besides the SLAM settings below slam.:\n' + '\n'.join(lines),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+
+
+def _help(setting: Setting) -> str:
+    return setting.help + (f' One of {", ".join(setting.choices)}.' if setting.choices else '')
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -22,7 +22,7 @@ from splatam_ros.diagnosis import Silence
 from splatam_ros.diagnostics import InputSample, Monitor, Sample
 from splatam_ros.gate import Gate
 from splatam_ros.geometry import Geometry
-from splatam_ros.inputs import Input
+from splatam_ros.inputs import Input, unused_overrides
 from splatam_ros.intake import Intake
 from splatam_ros.outputs import Outputs
 from splatam_ros.parameters import NodeOptions
@@ -70,6 +70,7 @@ class SplatamNode(Node):
         if self.options.load_path:
             self._session.load(self._slam)
         self._inputs = self._subscribe()
+        self._warn_of_unused_overrides()
         self._silence = Silence(self, self._inputs)
         self._counts = dict.fromkeys(Status, 0)
         self._num_dropped = self._num_refused = 0
@@ -111,6 +112,15 @@ class SplatamNode(Node):
             )
             for message_class, topic, on_message in streams
         ]  # fmt: skip
+
+    def _warn_of_unused_overrides(self) -> None:
+        odometry = [self._geometry.odometry.input] if self._geometry.odometry else []
+        topics = [item.topic for item in (*self._inputs, *odometry)]
+        for name in unused_overrides(self, topics):
+            self.get_logger().warning(
+                f"parameter '{name}' overrides nothing; expected qos_overrides.TOPIC.subscription.POLICY, "
+                f'TOPIC one of {", ".join(topics)}'
+            )
 
     # --- executor thread ---
 
@@ -211,7 +221,7 @@ class SplatamNode(Node):
     def _save(self) -> None:
         try:
             if self.options.folder is not None and self.options.save_on_shutdown:
-                self._session.save(self._slam)
+                self._session.finish(self._slam)
         finally:
             self._session.close()
 

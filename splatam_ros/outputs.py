@@ -10,7 +10,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import rclpy
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -225,7 +224,7 @@ class Outputs:
         """
         if result.T_world_cam is None:
             self._motion.lost()
-        elif rclpy.ok():
+        elif self._node.context.ok():
             located = self._geometry.frames.locate(result.stamp_ns, result.T_world_cam, self._geometry.camera_frame)
             if located is not None:
                 self._publish(located, result, slam)
@@ -233,7 +232,7 @@ class Outputs:
 
     def done(self, stamp_ns: int) -> None:
         """Say on ``~/processed`` that nothing more will come of the frame of this stamp."""
-        if rclpy.ok():
+        if self._node.context.ok():
             self._processed.publish(stamps.header(self._factory, stamp_ns, self._options.map_frame))
 
     @property
@@ -249,7 +248,7 @@ class Outputs:
 
     def catch_up(self) -> None:
         """Tell them: they may have come after the last frame."""
-        if self._moment is not None and rclpy.ok() and self.is_behind:
+        if self._moment is not None and self._node.context.ok() and self.is_behind:
             self._publish_due(self._moment, [row for row in self._publishers if row[0].qos is LATCHED_QOS])
 
     def _publish(self, located: Located, result: FrameResult, slam: Slam) -> None:

@@ -59,6 +59,8 @@ NODE_SETTINGS: tuple[Setting, ...] = (
              choices=('raw', 'compressed')),
     _setting('depth_transport', 'raw', 'What depth/image carries; compressedDepth: depth/image/compressedDepth.',
              choices=('raw', 'compressedDepth')),
+    _setting('depth_scale', 0.001, 'A count of 16-bit depth; drivers send millimetres, some recordings others.', 'm',
+             1e-6, 1.0),
     _setting('undistort', True, 'Undistort images by K and D; off = they are rectified (image_rect) to camera P.'),
     _setting('sync.mode', 'approximate', 'Pair colour and depth of equal, or of nearby stamps.',
              choices=('exact', 'approximate')),
@@ -112,6 +114,7 @@ class NodeOptions:
     stddev_orientation: float
     rgb_transport: str
     depth_transport: str
+    depth_scale: float
     undistort: bool
     sync_mode: str
     sync_max_interval: float

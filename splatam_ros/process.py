@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from types import FrameType, TracebackType
 
 import rclpy
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.signals import SignalHandlerOptions
 
 from splatam_core.errors import SplatamError
@@ -83,6 +84,9 @@ def ros(arguments: Sequence[str]) -> Iterator[None]:
     os.environ.setdefault(PROFILE_VARIABLE, str(config_dir() / 'fastdds_large_data.xml'))
     try:
         rclpy.init(args=['', *arguments], signal_handler_options=SignalHandlerOptions.NO)
+    except rclpy_implementation.UnknownROSArgsError as error:  # its text is the list of them
+        hint = 'a rule is -p NAME:=VALUE or -r NAME:=NAME, in quotes if it has spaces'
+        raise RosError(f'ROS arguments: not understood: {error}; {hint}') from None
     except RuntimeError as error:  # rclpy's errors have no narrower public base
         raise RosError(f'ROS arguments: {_first_sentence(error)}') from None
     try:

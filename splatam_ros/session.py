@@ -110,8 +110,7 @@ class Session:
         """Save map, trajectory and metrics in ``save_path``.
 
         Raises:
-            SplatamError: ``save_path`` is empty, or no folder can be made of it.
-            OSError: it cannot be written; what was saved before stays.
+            SplatamError: ``save_path`` is empty, no folder can be made of it, or it cannot be written.
         """
         path = self.options.folder
         if path is None:
@@ -120,10 +119,27 @@ class Session:
             self._folder = RunFolder.create(path, slam.config, self._description)
         elif self._folder.path != path:
             self._folder = self._folder.moved(path)
-        metrics = self._folder.save(slam)
+        try:
+            metrics = self._folder.save(slam)
+        except OSError as error:
+            why = f'cannot be saved: {error.strerror}; each file there is whole, of now or of the last time'
+            raise RunFolderError(f'{path}: {why}; save again when that is mended') from None
         self._logger.info(f'saved {metrics.frames} frames, {metrics.tracked} of them tracked, and '
                           f'{metrics.num_gaussians} Gaussians in {path}')  # fmt: skip
         return metrics
+
+    def finish(self, slam: Slam) -> None:
+        """Save at the end; where no frame ever came leave the folder empty, for the next attempt.
+
+        Raises:
+            SplatamError: as ``save``.
+        """
+        folder = self._folder
+        if folder is None or not folder.is_empty or folder.has_previous:
+            self.save(slam)
+            return
+        folder.discard()
+        self._logger.info(f'no frame came, so nothing is saved in {folder.path}')
 
     def load(self, slam: Slam) -> str:
         """Go on in the map at ``load_path``, from ``load_pose``. What there is to say.

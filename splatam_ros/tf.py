@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import rclpy
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -49,6 +48,7 @@ class Tf:
             hears_moving: whether to listen to ``/tf`` as well.
             says: whether to publish.
         """
+        self._node = node
         self._tree = tree
         self._warnings = warnings
         self._factory = RclpyMessages()
@@ -79,7 +79,7 @@ class Tf:
     def _publish(
         self, publisher: Publisher | None, stamp_ns: int, transforms: Mapping[tuple[str, str], Matrix]
     ) -> None:
-        if publisher is not None and transforms and rclpy.ok():
+        if publisher is not None and transforms and self._node.context.ok():
             messages = [
                 poses.transform_stamped(self._factory, T, stamp_ns, parent, child)
                 for (parent, child), T in transforms.items()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
 from importlib import metadata
@@ -13,6 +14,7 @@ from xml.etree import ElementTree
 import pytest
 
 from splatam_core.resources import config_dir
+from splatam_ros import entry
 
 ROOT = Path(__file__).resolve().parents[1]
 NAME = 'splatam_ros'
@@ -119,3 +121,12 @@ def test_without_ros_one_line_says_what_to_install(program: str) -> None:
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1 and 'pip install' in done.stderr
+
+
+@pytest.mark.parametrize('program', ['node', 'player'])
+def test_ctrl_c_while_it_loads_is_no_traceback(program: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(module: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(entry, 'import_module', interrupted)
+    assert getattr(entry, program)() == 128 + signal.SIGINT

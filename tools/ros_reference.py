@@ -27,6 +27,7 @@ from splatam_ros.services import SERVICES
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / 'docs' / 'ros.md'
 FEATURES = ROOT / 'test' / 'ros' / 'features.yaml'
+FAULTS = ROOT / 'test' / 'ros' / 'faults.yaml'
 SECTION = re.compile(r'(<!-- generated: (\w+) -->\n).*?(<!-- end -->)', re.DOTALL)
 
 
@@ -80,9 +81,19 @@ def features() -> str:
 
 
 def _feature(row: dict[str, Any]) -> Sequence[str]:
+    return row['feature'], row['level'], _shown(row)
+
+
+def faults() -> str:
+    """What happens when something fails, and the tests that show it."""
+    rows = yaml.safe_load(FAULTS.read_text())
+    return table(('fault', 'what happens', 'shown by'), ((row['fault'], row['happens'], _shown(row)) for row in rows))
+
+
+def _shown(row: dict[str, Any]) -> str:
     shown = [f'`{test}`' for test in row.get('tests', ())]
     shown += [row['not_tested']] if 'not_tested' in row else []
-    return row['feature'], row['level'], '<br>'.join(shown)
+    return '<br>'.join(shown)
 
 
 def services() -> str:
@@ -108,6 +119,7 @@ SECTIONS: dict[str, Callable[[], str]] = {
     'parameters': parameters,
     'services': services,
     'cameras': cameras,
+    'faults': faults,
     'features': features,
 }
 

@@ -162,6 +162,17 @@ def test_millimetres_in_any_byte_order_and_padding(factory, encoding, padding, b
     assert_array_equal(images.decode_depth(message), counts.astype(np.float32) / np.float32(1000))
 
 
+def test_counts_of_another_length(factory):
+    """TUM's recordings have 5000 a metre."""
+    counts = np.array([[0, 1, 5000, 65535]], np.uint16)
+    data = struct.pack('<iff', 0, 0.0, 0.0) + png(counts)
+    compressed = compressed_message(factory, '16UC1; compressedDepth png', data)
+    for message in (raw_message(factory, counts, '16UC1'), raw_message(factory, counts, 'mono16'), compressed):
+        assert_array_equal(images.decode_depth(message, 1 / 5000), counts.astype(np.float32) / np.float32(5000))
+    metres = images.depth_message(factory, random_depth(), STAMP_NS, FRAME)
+    assert_array_equal(images.decode_depth(metres, 1 / 5000), random_depth())
+
+
 @pytest.mark.parametrize('big_endian', [False, True])
 @pytest.mark.parametrize('padding', [0, 3])
 def test_metres_in_any_byte_order_and_padding(factory, padding, big_endian):

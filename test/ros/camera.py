@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +12,7 @@ from graph import Graph, Process
 from numpy.typing import NDArray
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 
 from msg_adapters import camera_info, images, stamps
@@ -43,14 +43,14 @@ def stamps_of(messages: list[Any]) -> list[int]:
 class Camera:
     """A camera of the test's, sending what it is told to."""
 
+    TOPICS: Mapping[str, tuple[type, str]] = {
+        'info': (CameraInfo, '/rgb/camera_info'), 'rgb': (Image, '/rgb/image'), 'depth': (Image, '/depth/image'),
+    }  # fmt: skip
+
     def __init__(self, graph: Graph, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> None:
         qos = QoSProfile(depth=100, reliability=reliability)
         self._graph = graph
-        self._publishers = {
-            'info': graph.publisher(CameraInfo, '/rgb/camera_info', qos),
-            'rgb': graph.publisher(Image, '/rgb/image', qos),
-            'depth': graph.publisher(Image, '/depth/image', qos),
-        }
+        self._publishers = {stream: graph.publisher(*topic, qos) for stream, topic in self.TOPICS.items()}
 
     def publisher(self, stream: str) -> Publisher:
         return self._publishers[stream]
@@ -66,26 +66,58 @@ class Camera:
         self, frame: RgbdFrame, *, depth_delay_ns: int = 0, only: Sequence[str] = STREAMS, **changes: Any
     ) -> None:
         """Send a frame's messages, or some of them; ``rgb__encoding='x'`` changes a field of one."""
-        c, stamp = frame.camera, frame.stamp_ns
-        parameters = camera_info.CameraParameters(c.width, c.height, c.fx, c.fy, c.cx, c.cy, frame_id=CAMERA_FRAME)
-        messages = {
-            'info': camera_info.info_message(MAKE, parameters, stamp),
-            'rgb': images.color_message(MAKE, frame.rgb, stamp, CAMERA_FRAME),
-            'depth': images.depth_message(MAKE, frame.depth_m, stamp + depth_delay_ns, CAMERA_FRAME),
-        }
+        messages = self.messages(frame, frame.stamp_ns + depth_delay_ns)
         for name, value in changes.items():
             message, _, attribute = name.partition('__')
             setattr(messages[message], attribute, value)
+        self.publish(messages, only)
+
+    def publish(self, messages: Mapping[str, Any], only: Sequence[str] = STREAMS) -> None:
         for name in only:
             self._publishers[name].publish(messages[name])
+
+    def messages(self, frame: RgbdFrame, depth_stamp_ns: int) -> dict[str, Any]:
+        return {
+            'info': info_message(frame),
+            'rgb': images.color_message(MAKE, frame.rgb, frame.stamp_ns, CAMERA_FRAME),
+            'depth': images.depth_message(MAKE, frame.depth_m, depth_stamp_ns, CAMERA_FRAME),
+        }
+
+
+class CompressedCamera(Camera):
+    """The same as image_transport's plugins send it. ``color`` is jpeg or png, ``depth`` 16UC1 or 32FC1."""
+
+    TOPICS = {
+        'info': (CameraInfo, '/rgb/camera_info'), 'rgb': (CompressedImage, '/rgb/image/compressed'),
+        'depth': (CompressedImage, '/depth/image/compressedDepth'),
+    }  # fmt: skip
+    PARAMETERS = {'rgb_transport': 'compressed', 'depth_transport': 'compressedDepth'}
+    color = 'jpeg'
+    depth = '16UC1'
+
+    def messages(self, frame: RgbdFrame, depth_stamp_ns: int) -> dict[str, Any]:
+        rgb, depth_m, frame_id = frame.rgb, frame.depth_m, CAMERA_FRAME
+        return {
+            'info': info_message(frame),
+            'rgb': images.compressed_color_message(MAKE, rgb, frame.stamp_ns, frame_id, self.color),
+            'depth': images.compressed_depth_message(MAKE, depth_m, depth_stamp_ns, frame_id, self.depth),
+        }
+
+
+def info_message(frame: RgbdFrame) -> CameraInfo:
+    c = frame.camera
+    parameters = camera_info.CameraParameters(c.width, c.height, c.fx, c.fy, c.cx, c.cy, frame_id=CAMERA_FRAME)
+    return camera_info.info_message(MAKE, parameters, frame.stamp_ns)
 
 
 class Live:
     """A node at work, fed frame by frame by a camera; each frame is waited for until it is done with."""
 
-    def __init__(self, graph: Graph, *ros_arguments: str, **parameters: Any) -> None:
+    def __init__(
+        self, graph: Graph, *ros_arguments: str, camera_class: type[Camera] = Camera, **parameters: Any
+    ) -> None:
         self.graph = graph
-        self.camera = Camera(graph)
+        self.camera = camera_class(graph)
         self.done = graph.collect(Header, '/splatam/processed')
         self.poses = graph.collect(PoseStamped, '/splatam/pose')
         self.node = run_node(graph, *ros_arguments, **parameters)

@@ -6,16 +6,18 @@ from dataclasses import replace
 
 import pytest
 from builtin_interfaces.msg import Time
-from camera import Camera
+from camera import Camera, run_node
 from graph import Graph
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Header
 
 from msg_adapters import camera_info
 from msg_adapters.camera_info import CameraParameters
 from msg_adapters.factory import RclpyMessages
+from splatam_core.datasets.synthetic import SyntheticSequence
 from splatam_ros.diagnosis import why_no_frames
 from splatam_ros.gate import Gate
 from splatam_ros.inputs import Input
@@ -102,6 +104,17 @@ def test_sim_time_without_a_clock(graph: Graph) -> None:
 
     graph.spin_until(tick, explain=receiver.why)
     assert publishers
+
+
+def test_a_node_by_sim_time_says_that_the_clock_stands(graph: Graph) -> None:
+    """Its watch goes on by the steady clock; and images have stamps, so that those that come are processed."""
+    node = run_node(graph, use_sim_time=True, no_data_timeout=1.0)
+    camera, done = Camera(graph), graph.collect(Header, '/splatam/processed')
+    camera.wait_matched()
+    node.wait_says('no frame for 1 s: use_sim_time is true and /clock has no publisher')
+    frame = SyntheticSequence(seed=0, noise=False, frames=12, width=64)[0]
+    camera.send(frame)
+    graph.spin_until(lambda: done, explain=lambda: node.text)
 
 
 def test_names_are_those_after_remapping(graph: Graph) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,14 @@ from geometry_msgs.msg import PoseStamped
 from graph import Graph, Process, node_arguments
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import Reader, Writer
+from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from msg_adapters import point_clouds, poses, stamps
+from msg_adapters.factory import RosbagsMessages
 from splatam_core import se3
 from splatam_core.config import load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
@@ -33,6 +38,7 @@ from splatam_ros.transforms import TransformTree
 CAMERA_IN_BASE = f'0.2 0 0.5 {-np.pi / 2 - 0.2} 0 {-np.pi / 2}'
 T_BASE_CAMERA = parse_pose('test', CAMERA_IN_BASE)
 TF = QoSProfile(depth=100)
+NO_TIME = QosTime(0, 0)
 EXACT = 1e-9  # matrices to quaternions and back, and products of them, in float64
 
 
@@ -152,6 +158,46 @@ def test_an_extrinsic_on_tf_static_is_waited_for(graph: Graph, tf_message: type,
     assert ears.fixed.keys() == {('base_link', 'camera_link'), ('camera_link', CAMERA_FRAME)}  # the robot's, not ours
     for stamp_ns, T_map_base in by_stamp(ears.odometry).items():
         assert_close(T_map_base @ T_BASE_CAMERA, by_stamp(ears.poses)[stamp_ns])
+
+
+def record_with_robot(bag: Path, path: Path) -> None:
+    """The recording, with the robot's transforms on /tf_static before the first image."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    name = 'tf2_msgs/msg/TFMessage'
+    transform = poses.transform_stamped(RosbagsMessages(store), T_BASE_CAMERA, 0, 'base_link', CAMERA_FRAME)
+    latched = Qos(QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, NO_TIME, NO_TIME,
+                  QosLiveliness.AUTOMATIC, NO_TIME, False)  # fmt: skip
+    with Reader(bag) as reader, Writer(path, version=9) as writer:
+        fixed = writer.add_connection('/tf_static', name, typestore=store, offered_qos_profiles=[latched])
+        writer.write(fixed, reader.start_time - 10**9, store.serialize_cdr(store.types[name]([transform]), name))
+        added = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=store) for c in reader.connections}
+        for connection, time_ns, data in reader.messages():
+            writer.write(added[connection.topic], time_ns, data)
+
+
+def test_a_recorded_extrinsic_arrives_though_playback_starts_later(
+    graph: Graph, tf_message: type, bag: Path, frames: SyntheticSequence
+) -> None:
+    """And all under other names: the player's remaps, and the node's."""
+    record_with_robot(bag, graph.folder / 'robot')
+    odometry = graph.collect(Odometry, '/robot/splatam/odometry')
+    node = run_node(
+        graph, '-r', '__ns:=/robot', '-r', 'rgb/image:=/camera/color', '-r', 'depth/image:=/camera/depth',
+        '-r', 'rgb/camera_info:=/camera/info', base_frame='base_link', queue_policy='all', exit_on_publisher_end=True,
+        camera_frame=CAMERA_FRAME,
+    )  # fmt: skip
+    graph.spin_until(lambda: graph.node.count_publishers('/robot/splatam/odometry'), explain=lambda: node.text)
+    player = graph.play(
+        str(graph.folder / 'robot'), '--start-offset', '1.09', '--remap', '/rgb/image:=/camera/color',
+        '/depth/image:=/camera/depth', '/rgb/camera_info:=/camera/info', '--rate', 'max',
+        '--wait-for', '/robot/splatam/processed',
+    )  # fmt: skip
+    graph.spin_until(lambda: not node.is_running, explain=lambda: player.text + node.text)
+    assert (player.wait(), node.wait()) == (0, 0), player.text + node.text
+    graph.spin_until(lambda: odometry and stamps.message_stamp_ns(odometry[-1]) == frames[-1].stamp_ns)
+    assert [stamps.message_stamp_ns(message) for message in odometry] == [frame.stamp_ns for frame in frames][3:]
+    assert {message.child_frame_id for message in odometry} == {'base_link'}
+    assert_close(by_stamp(odometry[:1])[frames[3].stamp_ns], se3.inverse(T_BASE_CAMERA))
 
 
 def test_a_camera_with_a_parent_gets_no_second_one(graph: Graph, tf_message: type, frames: SyntheticSequence) -> None:

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
+import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from camera import CAMERA_FRAME, MAKE, Live, position, still
+from camera import CAMERA_FRAME, MAKE, QUICK, CompressedCamera, Live, position, still
 from graph import Graph
-from sensor_msgs.msg import CameraInfo
+from sensor_msgs.msg import CameraInfo, RegionOfInterest
 
-from msg_adapters import camera_info, images
+from msg_adapters import camera_info, images, poses
 from msg_adapters.camera_info import CameraParameters
+from splatam_core.camera import CameraCalibration, FrameFactory
+from splatam_core.config import load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
+from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame
 from splatam_ros.gate import Gate
 from splatam_ros.intake import Intake
@@ -201,35 +206,128 @@ def bayer_rggb(rgb: np.ndarray) -> np.ndarray:
     return mosaic
 
 
+def from_millimetres(counts: np.ndarray) -> np.ndarray:
+    return counts.astype(np.float32) / np.float32(1000)
+
+
+# By encoding: how it is written, and what is to be read. OpenCV's names of today say what ROS's say.
 COLOURS = {
-    'bgr8': lambda rgb: rgb[..., ::-1],
-    'rgba8': lambda rgb: np.dstack([rgb, np.full(rgb.shape[:2], 7, np.uint8)]),
-    'bgra8': lambda rgb: np.dstack([rgb[..., ::-1], np.full(rgb.shape[:2], 7, np.uint8)]),
-    'mono8': lambda rgb: cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY),
-    'bayer_rggb8': bayer_rggb,
-    'yuv422': uyvy,
-    'yuv422_yuy2': lambda rgb: uyvy(rgb)[..., ::-1],
+    'bgr8': (lambda rgb: rgb[..., ::-1], lambda bgr: bgr[..., ::-1].copy()),
+    'rgba8': (lambda rgb: np.dstack([rgb, np.full(rgb.shape[:2], 7, np.uint8)]), lambda rgba: rgba[..., :3].copy()),
+    'bgra8': (lambda rgb: np.dstack([rgb[..., ::-1], rgb[..., :1]]), lambda bgra: bgra[..., 2::-1].copy()),
+    'mono8': (lambda rgb: cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), lambda mono: np.dstack([mono] * 3)),
+    'bayer_rggb8': (bayer_rggb, lambda mosaic: cv2.cvtColor(mosaic, cv2.COLOR_BayerRGGB2RGB)),
+    'yuv422': (uyvy, lambda pixels: cv2.cvtColor(pixels, cv2.COLOR_YUV2RGB_UYVY)),
+    'yuv422_yuy2': (
+        lambda rgb: np.ascontiguousarray(uyvy(rgb)[..., ::-1]),
+        lambda pixels: cv2.cvtColor(pixels, cv2.COLOR_YUV2RGB_YUYV),
+    ),
 }
 DEPTHS = {
-    '16UC1': lambda depth_m: np.rint(depth_m * 1000).astype('<u2'),
-    'mono16': lambda depth_m: np.rint(depth_m * 1000).astype('<u2'),
-    '16UC1 big-endian': lambda depth_m: np.rint(depth_m * 1000).astype('>u2'),
-    '32FC1 big-endian': lambda depth_m: depth_m.astype('>f4'),
+    '16UC1': (lambda depth_m: np.rint(depth_m * 1000).astype('<u2'), from_millimetres),
+    'mono16': (lambda depth_m: np.rint(depth_m * 1000).astype('<u2'), from_millimetres),
+    '16UC1 big-endian': (lambda depth_m: np.rint(depth_m * 1000).astype('>u2'), from_millimetres),
+    '32FC1 big-endian': (lambda depth_m: depth_m.astype('>f4'), lambda depth_m: depth_m.astype(np.float32)),
 }
+
+
+class Twins:
+    """A node, and the same SLAM without one: what the node takes in is right if both find the same poses exactly."""
+
+    def __init__(self, graph: Graph, **options: Any) -> None:
+        self.live = Live(graph, queue_policy='all', **options)
+        self._slam = Slam(load_config('quick', QUICK))
+
+    def assert_same(self, what: str, expected: RgbdFrame, sent: RgbdFrame | None = None, **changes: Any) -> None:
+        """What is sent is to be seen as what is expected."""
+        pose = self.live.show(sent or expected, **changes)
+        assert pose is not None, f'{what}: {self.live.node.text}'
+        T_world_cam = self._slam.process(expected).T_world_cam
+        assert pose == poses.pose_stamped(MAKE, T_world_cam, expected.stamp_ns, 'map'), what
+
+
+def test_poses_tell_views_apart(frames: SyntheticSequence) -> None:
+    """What the tests below rest on: a little of colour or depth, and the pose is another."""
+    first, second = still(frames, 0), still(frames, 1)
+    red_for_blue = replace(second, rgb=second.rgb[..., ::-1].copy())
+    one_pixel = second.depth_m.copy()
+    one_pixel[20, 30] += 0.002
+    found = []
+    for frame in (second, red_for_blue, replace(second, depth_m=one_pixel)):
+        slam = Slam(load_config('quick', QUICK))
+        slam.process(first)
+        found.append(slam.process(frame).T_world_cam)
+    assert not (np.array_equal(found[0], found[1]) or np.array_equal(found[0], found[2]))
 
 
 def test_every_encoding_reaches_slam_as_the_same_view(graph: Graph, frames: SyntheticSequence) -> None:
-    """Pixels in another order, scale or place would not agree with the map: the frame would be lost."""
-    live = Live(graph, queue_policy='all', slam__tracking__min_inlier_fraction=0.7, slam__tracking__iterations=20)
-    assert live.show(still(frames, 0))
-    for number, (encoding, encode) in enumerate({**COLOURS, **DEPTHS}.items(), start=1):
+    twins = Twins(graph)
+    twins.assert_same('rgb8, 32FC1', still(frames, 0))
+    for number, (encoding, (encode, decode)) in enumerate({**COLOURS, **DEPTHS}.items(), start=1):
         frame = still(frames, number)
-        name = 'rgb' if encoding in COLOURS else 'depth'
-        pixels = encode(frame.rgb if name == 'rgb' else frame.depth_m)
-        fields = {'encoding': encoding.split()[0], 'is_bigendian': int('big' in encoding), **padded(pixels)}
-        pose = live.show(frame, **{f'{name}__{field}': value for field, value in fields.items()})
-        assert pose is not None, f'{encoding}: {live.node.text}'
-        assert np.linalg.norm(position(pose)) < STILL_M, encoding
+        name, field = ('rgb', 'rgb') if encoding in COLOURS else ('depth', 'depth_m')
+        pixels = encode(getattr(frame, field))
+        changes = {'encoding': encoding.split()[0], 'is_bigendian': int('big' in encoding), **padded(pixels)}
+        expected = replace(frame, **{field: decode(pixels)})
+        twins.assert_same(encoding, expected, frame, **{f'{name}__{key}': value for key, value in changes.items()})
+
+
+def part_of_a_larger_sensor(frame: RgbdFrame) -> dict[str, Any]:
+    """CameraInfo of a sensor of which every second pixel of a part makes the frame."""
+    c, x, y = frame.camera, 16, 12
+    k = [2 * c.fx, 0.0, 2 * c.cx + 0.5 + x, 0.0, 2 * c.fy, 2 * c.cy + 0.5 + y, 0.0, 0.0, 1.0]
+    roi = RegionOfInterest(x_offset=x, y_offset=y, width=2 * c.width, height=2 * c.height)
+    return {
+        'info__width': 2 * c.width + 40, 'info__height': 2 * c.height + 30, 'info__k': k, 'info__roi': roi,
+        'info__binning_x': 2, 'info__binning_y': 2,
+    }  # fmt: skip
+
+
+def test_every_camera_reaches_slam_as_the_same_view(graph: Graph, frames: SyntheticSequence) -> None:
+    """Lenses, parts of sensors, smaller depth, depth in other steps, late depth; another camera would start a new map."""
+    twins = Twins(graph, sync__max_interval=0.1, depth_scale=0.0002)  # which floats, metres, are not concerned by
+    numbers = itertools.count()
+    twins.assert_same('pinhole', still(frames, next(numbers)))
+    for model, d in COEFFICIENTS:
+        sent = still(frames, next(numbers))
+        c = sent.camera
+        pinhole = CameraParameters(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
+        parameters = replace(pinhole, distortion_model=model, distortion=tuple(d))
+        factory = FrameFactory(CameraCalibration.from_intrinsics(parameters), None)  # tested against OpenCV
+        expected = factory.make(sent.stamp_ns, sent.rgb, sent.depth_m)
+        assert not np.array_equal(expected.rgb, sent.rgb)
+        twins.assert_same(model, expected, sent, info__distortion_model=model, info__d=d)
+    frame = still(frames, next(numbers))
+    twins.assert_same('binning and region of interest', frame, **part_of_a_larger_sensor(frame))
+    frame = still(frames, next(numbers))
+    small = images.depth_message(MAKE, frame.depth_m[::2, ::2], frame.stamp_ns, CAMERA_FRAME)
+    doubled = frame.depth_m[::2, ::2].repeat(2, axis=0).repeat(2, axis=1)
+    fields = {f'depth__{field}': getattr(small, field) for field in ('width', 'height', 'step', 'data')}
+    twins.assert_same('depth of half the resolution', replace(frame, depth_m=doubled), frame, **fields)
+    frame = still(frames, next(numbers))
+    counts = np.rint(frame.depth_m * 5000).astype('<u2')
+    fields = {'depth__encoding': '16UC1', 'depth__step': 2 * counts.shape[1], 'depth__data': counts.tobytes()}
+    expected = replace(frame, depth_m=counts.astype(np.float32) / np.float32(5000))
+    twins.assert_same('depth in fifths of a millimetre', expected, frame, **fields)
+    assert not twins.live.node.says('WARN')
+    twins.assert_same('far apart', still(frames, next(numbers)), depth_delay_ns=45_000_000)
+    twins.live.wait_says('WARN', 'depth is +0.045 s from its colour')
+
+
+def test_every_compression_reaches_slam_as_the_same_view(graph: Graph, frames: SyntheticSequence) -> None:
+    twins = Twins(graph, camera_class=CompressedCamera, **CompressedCamera.PARAMETERS)
+    camera = twins.live.camera
+    pairs = itertools.product(('jpeg', 'png'), ('16UC1', '32FC1'))  # the latter as inverse depth in steps
+    for number, (camera.color, camera.depth) in enumerate(pairs):
+        frame = still(frames, number)
+        messages = camera.messages(frame, frame.stamp_ns)
+        bgr = cv2.imdecode(np.frombuffer(messages['rgb'].data, np.uint8), cv2.IMREAD_COLOR)
+        config = struct.unpack('<iff', bytes(messages['depth'].data[:12]))
+        counts = cv2.imdecode(np.frombuffer(messages['depth'].data[12:], np.uint8), cv2.IMREAD_UNCHANGED)
+        depth_m = from_millimetres(counts) if camera.depth == '16UC1' else np.float32(config[1]) / counts
+        expected = replace(frame, rgb=bgr[..., ::-1].copy(), depth_m=depth_m.astype(np.float32))
+        twins.assert_same(f'{camera.color}, {camera.depth}', expected, frame)
+    assert not twins.live.node.says('WARN')
 
 
 def test_a_camera_that_changes_starts_a_new_map(graph: Graph, frames: SyntheticSequence) -> None:

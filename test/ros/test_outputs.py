@@ -2,32 +2,43 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from camera import CAMERA_FRAME, LATCHED, Camera, run_node, still
+from camera import CAMERA_FRAME, LATCHED, QUICK, Camera, run_node, still
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from graph import Graph
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from sensor_msgs.msg import PointCloud2, PointField
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import Reader, Writer
+from rosbags.typesys import Stores, get_typestore
+from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
 from msg_adapters import stamps
+from splatam_core.config import load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
 from splatam_core.resources import config_dir
-from splatam_core.types import RgbdFrame, Status
+from splatam_core.slam import Slam
+from splatam_core.types import MapSnapshot, RenderedView, RgbdFrame, Status
 from splatam_ros import interface
 from splatam_ros.diagnostics import InputSample, Sample, reports
-from splatam_ros.outputs import OUTPUTS
-from splatam_ros.parameters import NODE_SETTINGS
+from splatam_ros.geometry import Geometry
+from splatam_ros.outputs import OUTPUTS, Outputs
+from splatam_ros.parameters import NODE_SETTINGS, NodeOptions
+from splatam_ros.recording import message_class
+from splatam_ros.throttled_warnings import ThrottledWarnings
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -124,6 +135,7 @@ def test_diagnostics_say_what_comes_and_goes(graph: Graph, frames: SyntheticSequ
         'splatam: input', 'splatam: tracking', 'splatam: processing', 'splatam: map'
     ]  # fmt: skip
     assert {status.hardware_id for status in array.status} == {CAMERA_FRAME}
+    assert 0.9 < np.median(np.diff([stamps.message_stamp_ns(array) for array in diagnostics.arrays])) / 1e9 < 1.5
     assert abs(stamps.message_stamp_ns(array) - graph.node.get_clock().now().nanoseconds) < 10e9
     for topic in topics:
         assert 0.5 <= float(values('input', f'{topic} delay (s)')) < 30  # more than 0.5: a backlog, on a busy machine
@@ -189,6 +201,62 @@ def test_the_map_is_there_for_whoever_comes_after_the_last_frame(graph: Graph, f
     assert len(clouds) == len(paths) == 1  # nothing new, nothing said
 
 
+class Counted(Slam):
+    """How often was it asked for something that costs?"""
+
+    renders = snapshots = 0
+
+    def render(self, T_world_cam: np.ndarray) -> RenderedView:
+        self.renders += 1
+        return super().render(T_world_cam)
+
+    def snapshot(self) -> MapSnapshot:
+        self.snapshots += 1
+        return super().snapshot()
+
+
+def test_what_costs_is_made_for_listeners_only_and_at_its_rate(graph: Graph, frames: SyntheticSequence) -> None:
+    defaults = {setting.name.replace('.', '_'): setting.default for setting in NODE_SETTINGS}
+    options = NodeOptions(**{**defaults, 'publish_tf': False, 'publish_rate_render': 4.0, 'publish_rate_cloud': 2.0})
+    warnings = ThrottledWarnings(graph.node.get_logger())
+    outputs = Outputs(graph.node, options, Geometry(graph.node, options, warnings, lambda: CAMERA_FRAME))
+    slam = Counted(load_config('quick', QUICK))
+    result = slam.process(frames[0])
+
+    numbers = itertools.count()
+
+    def publish() -> None:
+        outputs.publish(replace(result, stamp_ns=result.stamp_ns + 10**7 * next(numbers)), slam)
+        graph.spin_for(0.02)
+
+    def publish_for(seconds: float) -> None:
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s:
+            publish()
+
+    poses = graph.collect(PoseStamped, '/test/pose')
+    graph.spin_until(lambda: publish() or len(poses) > 5)
+    assert slam.renders == slam.snapshots == 0
+
+    topics = {'render/rgb': Image, 'render/depth': Image, 'render/silhouette': Image, 'path': PathMessage}
+    heard = {topic: graph.collect(message_class, f'/test/{topic}') for topic, message_class in topics.items()}
+    graph.spin_until(lambda: all(graph.node.count_subscribers(f'/test/{topic}') for topic in topics))
+    publish_for(2.0)
+    assert slam.snapshots == 0
+    # Of two seconds there are as many messages as the rate says, and one more at the start; a busy machine has fewer.
+    assert 4 <= slam.renders <= 9  # one serves all three images
+    assert {len(heard[topic]) for topic in topics if 'render' in topic} == {slam.renders}
+    assert 1 <= len(heard['path']) <= 3
+    clouds = graph.collect(PointCloud2, '/test/map/points')
+    graph.spin_until(lambda: graph.node.count_subscribers('/test/map/points'))
+    publish_for(2.0)
+    assert 2 <= len(clouds) == slam.snapshots <= 5
+    outputs.use(replace(options, publish_rate_cloud=0.0))
+    before = slam.snapshots
+    publish_for(0.5)
+    assert slam.snapshots > before + 5  # with every pose
+
+
 def check_cloud(cloud: PointCloud2, count: int) -> None:
     """The layout that RViz's RGB8 transformer and Foxglove's ``rgb`` colour mode read, and ours behind it."""
     assert [(field.name, field.offset, field.datatype, field.count) for field in cloud.fields] == [
@@ -199,6 +267,66 @@ def check_cloud(cloud: PointCloud2, count: int) -> None:
     opacity, radius = np.frombuffer(bytes(cloud.data), '<f4').reshape(count, 6)[:, 4:].T
     assert ((opacity > 0) & (opacity < 1)).all()
     assert ((radius > 1e-4) & (radius < 0.5)).all()  # metres; Gaussians of a room seen by 64x48 pixels
+
+
+# --- the standard recorder: it cannot run here, so this does what it does ---
+
+
+def recorder_qos(offered: QoSProfile) -> QoSProfile:
+    """As rosbag2 adapts to what is offered: no less, so that nothing is lost, and no more, so that something comes."""
+    return QoSProfile(depth=100, reliability=offered.reliability, durability=offered.durability)
+
+
+def recorded_qos(offered: QoSProfile) -> Qos:
+    latched = offered.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
+    none = QosTime(0, 0)
+    return Qos(QosHistory.KEEP_LAST, offered.depth or 1, QosReliability.RELIABLE, durability, none, none,
+               QosLiveliness.AUTOMATIC, none, False)  # fmt: skip
+
+
+def test_what_was_recorded_of_the_node_plays_back(
+    graph: Graph, tf_message: type, bag: Path, frames: SyntheticSequence
+) -> None:
+    """Every output, raw, by the types and QoS that the graph tells; read by another library, and played again."""
+    node = run_node(graph, queue_policy='all', exit_on_publisher_end=True, publish_rate__path=0.0,
+                    publish_rate__cloud=0.0)  # fmt: skip
+    topics = [*TOPICS, '/splatam/processed', '/tf', '/diagnostics']
+    graph.spin_until(lambda: all(map(graph.node.count_publishers, topics)), explain=lambda: node.text)
+    infos = {topic: graph.node.get_publishers_info_by_topic(topic)[0] for topic in topics}
+    heard = {
+        topic: graph.collect(message_class(info.topic_type), topic, recorder_qos(info.qos_profile), raw=True)
+        for topic, info in infos.items()
+    }
+    player = graph.play(str(bag), '--rate', 'max', '--wait-for')
+    graph.spin_until(lambda: not node.is_running, explain=lambda: player.text + node.text)
+    assert (player.wait(), node.wait()) == (0, 0), player.text + node.text
+    graph.spin_until(lambda: len(heard['/splatam/pose']) == len(heard['/tf']) == len(frames) and all(heard.values()))
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    copy = graph.folder / 'outputs'
+    with Writer(copy, version=9) as writer:
+        for topic, messages in heard.items():
+            offered = recorded_qos(infos[topic].qos_profile)
+            type_name = infos[topic].topic_type
+            added = writer.add_connection(topic, type_name, typestore=store, offered_qos_profiles=[offered])
+            for number, data in enumerate(messages):
+                writer.write(added, 10**9 + number * 10**8, data)
+    with Reader(copy) as reader:
+        for connection, _, data in reader.messages():
+            assert store.deserialize_cdr(data, connection.msgtype) is not None
+    again = {
+        topic: graph.collect(message_class(infos[topic].topic_type), f'/again{topic}', LATCHED, raw=True)
+        for topic in ('/splatam/path', '/splatam/map/points')
+    }
+    replay = graph.play(
+        str(copy), '--rate', 'max', '--no-wait-for-subscribers', '--loop', '--delay', '0.5', '--remap',
+        *(f'{topic}:=/again{topic}' for topic in topics),
+    )  # fmt: skip
+    graph.spin_until(lambda: all(again.values()), explain=lambda: replay.text)
+    assert not replay.says('left out')
+    for topic, messages in again.items():  # latched as recorded: they reach whoever asks for that
+        assert messages[0] in heard[topic]
 
 
 # --- viewers: neither can run in a test, but what they need can be checked ---

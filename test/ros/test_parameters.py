@@ -66,10 +66,12 @@ def test_ros_shows_what_is_used_not_what_was_the_default(make_node: MakeNode) ->
 def test_every_setting_has_a_descriptor_with_help_and_bounds(make_node: MakeNode) -> None:
     node = make_node()
     parameters.declare(node)
-    for setting in settings():
-        descriptor = node.describe_parameter(f'slam.{setting.name}')
-        assert descriptor.description.startswith(setting.help)
-        why = parameters.why_fixed(f'slam.{setting.name}')
+    named = {f'slam.{setting.name}': setting for setting in settings()} | {item.name: item for item in NODE_SETTINGS}
+    for name, setting in named.items():
+        descriptor = node.describe_parameter(name)
+        assert setting.help and descriptor.description.startswith(setting.help)
+        assert not setting.unit or descriptor.description.endswith(f'[{setting.unit}]')
+        why = parameters.why_fixed(name)
         assert ('cannot change at run time' in descriptor.additional_constraints) == bool(why)
         ranges = [*descriptor.integer_range, *descriptor.floating_point_range]
         assert len(ranges) == (setting.minimum is not None or setting.maximum is not None)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
-LEVELS = ('MUST', 'SHOULD', 'not possible')
+LEVELS = ('MUST', 'SHOULD', 'optional', 'not possible')
 
 
 def load_tool():
@@ -22,6 +23,7 @@ def load_tool():
 
 TOOL = load_tool()
 FEATURES = yaml.safe_load(TOOL.FEATURES.read_text())
+FAULTS = yaml.safe_load(TOOL.FAULTS.read_text())
 
 
 def test_the_page_is_what_the_code_says(capsys: pytest.CaptureFixture[str]) -> None:
@@ -48,7 +50,17 @@ def test_a_page_without_a_section_is_an_error() -> None:
 def test_every_feature_is_shown_by_tests_that_exist(row: dict) -> None:
     assert row.keys() <= {'feature', 'level', 'tests', 'not_tested'} and row['level'] in LEVELS
     assert row.get('tests') or row.get('not_tested')
-    for name in row.get('tests', ()):
+    check_exist(row.get('tests', ()))
+
+
+@pytest.mark.parametrize('row', FAULTS, ids=lambda row: row['fault'][:40])
+def test_every_fault_is_tried_by_tests_that_exist(row: dict) -> None:
+    assert row.keys() == {'fault', 'happens', 'tests'} and row['tests']
+    check_exist(row['tests'])
+
+
+def check_exist(tests: Sequence[str]) -> None:
+    for name in tests:
         path, _, function = name.partition('::')
         assert function in functions(ROOT / path), f'{name} does not exist'
 
