@@ -132,6 +132,10 @@ class TrackingConfig:
     depth_outlier_ratio: float = _setting(
         0.0, "Of the paper's tracker: pixels count up to this many median depth errors; 0 = all.", '', 0.0
     )
+    blended_depth: bool = _setting(
+        False, "Of the paper's tracker: compare the blended depth, short where the map is thin, as the original does, and not "
+        'the expected one.',
+    )  # fmt: skip
     motion_model: str = _setting(
         'constant_velocity', 'Where tracking starts from.', choices=('constant_velocity', 'last_pose')
     )
@@ -220,9 +224,18 @@ class MappingConfig:
     scale_rate: float = _setting(1e-3, 'Adam step of the log scales.', '', 0.0)
     rotation_rate: float = _setting(1e-3, "Adam step of anisotropic Gaussians' unit quaternions.", '', 0.0)
     prune_every: int = _setting(20, 'Prune before every n-th step of a frame; 0 = never.', 'steps', 0)
-    prune_until: int = _setting(20, 'Last step of a frame that may prune.', 'steps', 0)
+    prune_from: int = _setting(0, 'First step of a frame that may prune. Not of fused fitting.', 'steps', 0)
+    prune_until: int = _setting(20, 'Last step of a frame that may prune or reset opacities. Not of fused fitting.', 'steps', 0)
     prune_opacity: float = _setting(0.005, 'Prune Gaussians fainter than this.', '', 0.0, 1.0)
+    prune_last_opacity: float = _setting(
+        0.0, 'The same at step prune_until; 0 = as at the others. Not of fused fitting.', '', 0.0, 1.0
+    )
     prune_scale: float = _setting(0.1, 'Prune Gaussians wider than this share of the scene radius.', '', 0.0)
+    prune_scale_from: int = _setting(0, 'First step of a frame that prunes wide ones too. Not of fused fitting.', 'steps', 0)
+    reset_opacity_every: int = _setting(
+        0, 'Make all Gaussians 1 % opaque before every n-th step of a frame but the first; 0 = never. Not of fused fitting.',
+        'steps', 0,
+    )  # fmt: skip
     prune_share: float = _setting(
         0.0, 'Of fused fitting: prune only once this share of the map is to go; the map is copied then.', '', 0.0, 1.0
     )
@@ -323,9 +336,16 @@ def with_values(config: SlamConfig, values: Mapping[str, object]) -> SlamConfig:
             'mapping.anisotropic = true: fused fitting knows isotropic Gaussians only; set it to false, or '
             'mapping.optimizer=autograd'
         )
-    if config.mapping.optimizer == 'fused' and config.mapping.depth_outlier_ratio > 0:
-        raise ConfigError('mapping.depth_outlier_ratio: fused fitting has none; set it to 0, or mapping.optimizer=autograd')
+    if config.mapping.optimizer == 'fused':
+        _check_fused(config.mapping)
     return config
+
+
+def _check_fused(config: MappingConfig) -> None:
+    """Make sure that nothing is asked of fused fitting that it does not do."""
+    for name in ('depth_outlier_ratio', 'prune_from', 'prune_last_opacity', 'prune_scale_from', 'reset_opacity_every'):
+        if getattr(config, name) > 0:
+            raise ConfigError(f'mapping.{name}: fused fitting has none; set it to 0, or mapping.optimizer=autograd')
 
 
 def flat_values(config: SlamConfig) -> dict[str, Value]:

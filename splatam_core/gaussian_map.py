@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -134,6 +135,16 @@ class GaussianMap:
         assert self._optimizer is not None
         self._optimizer.step()
         self._optimizer.zero_grad(set_to_none=True)
+
+    def set_opacities(self, opacity: float) -> None:
+        """Give all the same opacity, in (0, 1); what their logits' gradients and moments have collected is forgotten."""
+        logits = self.logit_opacities
+        with torch.no_grad():
+            logits.fill_(math.log(opacity / (1 - opacity)))
+        logits.grad = None
+        if self._optimizer is not None and (state := self._optimizer.state.get(logits)):
+            for name in ('exp_avg', 'exp_avg_sq'):
+                state[name].zero_()
 
     def stop_optimization(self) -> None:
         """Cut the parameters off from autograd."""

@@ -64,7 +64,7 @@ def refine_map(
         render = rasterizer.render(gaussian_map.gaussians, posed.view.camera, posed.T_cam_world)
         mapping_loss(render, posed.view, weights).backward()
         if weights.prune_every and step % PRUNE_EVERY == 0:
-            gaussian_map.keep(~prunable(gaussian_map, weights, scene_radius))
+            gaussian_map.keep(~prunable(gaussian_map, weights.prune_opacity, weights.prune_scale * scene_radius))
         gaussian_map.step()
     gaussian_map.stop_optimization()
     return gaussian_map.gaussians.detached()
