@@ -15,7 +15,7 @@ from typing import Any, Union, get_type_hints
 
 import yaml
 
-from splatam_core.errors import ConfigError
+from splatam_core.errors import ConfigError, one_line
 from splatam_core.resources import config_dir
 
 Value = Union[bool, int, float, str]
@@ -383,7 +383,7 @@ def _read_preset(preset: str) -> dict[str, Any]:
     try:
         values = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f'{path}: cannot be read: {error}') from None
+        raise ConfigError(f'{path}: cannot be read: {one_line(error)}') from None
     if not isinstance(values, (dict, type(None))):
         raise ConfigError(f'{path}: expected a mapping of settings')
     return values or {}

@@ -103,6 +103,11 @@ def fused_mesh(
 def _open3d() -> Any:
     try:
         import open3d
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise ExportError(f"a mesh needs Open3D ({error}): pip install 'splatam_ros[mesh]'") from None
+    except (ImportError, OSError) as error:  # its wheel expects some of the system's libraries
+        raise ExportError(
+            f'a mesh needs Open3D, which is installed but does not load: {error}; on Debian and Ubuntu: apt install '
+            'libusb-1.0-0 libgl1 libgomp1'
+        ) from None
     return open3d

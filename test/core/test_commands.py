@@ -291,6 +291,17 @@ def test_export_of_a_mesh_names_its_extra(
     assert not (tmp_path / 'm.ply').exists()
 
 
+def test_export_of_a_mesh_names_the_libraries_that_open3d_lacks(
+    run: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / 'open3d.py').write_text("raise OSError('libusb-1.0.so.0: cannot open shared object file')")
+    monkeypatch.delitem(sys.modules, 'open3d', raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert splatam('export', run.path, tmp_path / 'm.ply', '--as', 'mesh') == 2
+    error = capsys.readouterr().err
+    assert 'libusb-1.0.so.0' in error and 'apt install libusb-1.0-0' in error and 'pip install' not in error
+
+
 def test_exported_mesh_lies_where_the_map_is_seen(run: RunRecord, tmp_path: Path) -> None:
     open3d = pytest.importorskip('open3d')
     arguments = ['--as', 'mesh', '--voxel', 0.03, '--every', 1]
