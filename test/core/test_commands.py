@@ -317,6 +317,29 @@ def test_exported_mesh_lies_where_the_map_is_seen(run: RunRecord, tmp_path: Path
     assert np.median(error_m) < 0.03  # a voxel
 
 
+def test_export_for_the_original_s_programs(run: RunRecord, tmp_path: Path) -> None:
+    """Names, shapes and kinds of poses as its viewers read them; nothing in the file needs pickle."""
+    assert splatam('export', run.path, tmp_path / 'params.npz', '--as', 'splatam') == 0
+    params = dict(np.load(tmp_path / 'params.npz', allow_pickle=False))
+    gaussians, poses, n = run.read_map(), run.trajectory.T_world_cam, len(run.read_map())
+    shapes = {name: values.shape for name, values in params.items()}
+    assert shapes == {
+        'means3D': (n, 3), 'rgb_colors': (n, 3), 'unnorm_rotations': (n, 4), 'logit_opacities': (n, 1),
+        'log_scales': (n, 1), 'cam_unnorm_rots': (1, 4, FRAMES), 'cam_trans': (1, 3, FRAMES), 'timestep': (n,),
+        'intrinsics': (3, 3), 'w2c': (4, 4), 'org_width': (), 'org_height': (), 'gt_w2c_all_frames': (FRAMES, 4, 4),
+        'keyframe_time_indices': params['keyframe_time_indices'].shape,
+    }  # fmt: skip
+    assert np.array_equal(params['means3D'], gaussians.means) and np.array_equal(params['log_scales'], gaussians.log_scales)
+    for index, T_world_cam in enumerate(poses):
+        T_cam_world = se3.compose(params['cam_unnorm_rots'][0, :, index], params['cam_trans'][0, :, index])
+        assert np.abs(T_cam_world @ T_world_cam - np.eye(4)).max() < 1e-6
+    truth = open_sequence('synthetic', width=WIDTH, max_frames=FRAMES).ground_truth().T_world_cam
+    assert np.allclose(params['gt_w2c_all_frames'][0], np.eye(4), atol=1e-6)
+    assert np.allclose(params['gt_w2c_all_frames'][-1], se3.inverse(truth[FRAMES - 1]) @ truth[0], atol=1e-5)
+    keyframes = [index for index, frame in enumerate(run.frames) if frame.is_keyframe]
+    assert params['keyframe_time_indices'].tolist() == keyframes and keyframes[0] == 0
+
+
 def test_export_refuses_what_it_cannot_write(
     run: RunRecord, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
