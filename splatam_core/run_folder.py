@@ -394,7 +394,7 @@ class RunRecord:
             raise RunFolderError(f'{self.path}: {error}') from None
 
 
-def write_refined(run: RunRecord, path: Path, gaussians: Gaussians, iterations: int) -> None:
+def write_refined(run: RunRecord, path: Path, gaussians: Gaussians, iterations: int, densified: bool = False) -> None:
     """Write a run's folder anew with another map; scores of images are gone, the rest is as it was.
 
     Args:
@@ -402,6 +402,7 @@ def write_refined(run: RunRecord, path: Path, gaussians: Gaussians, iterations: 
         path: the new folder.
         gaussians: the new map.
         iterations: how many steps were taken from the old one.
+        densified: whether they added Gaussians.
 
     Raises:
         RunFolderError: something is at the path, or it cannot be written.
@@ -409,7 +410,7 @@ def write_refined(run: RunRecord, path: Path, gaussians: Gaussians, iterations: 
     information = json.loads((run.path / RUN).read_text())
     information |= {
         'program': 'splatam refine', 'refined_from': str(run.path.resolve()), 'refined_iterations': iterations,
-        'started': _now(), 'commit': environment.commit(), 'machine': environment.machine(),
+        'refined_densified': densified, 'started': _now(), 'commit': environment.commit(), 'machine': environment.machine(),
         'versions': environment.versions(),
     }  # fmt: skip
     check_is_free(path)

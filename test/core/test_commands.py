@@ -248,6 +248,17 @@ def test_refine_makes_a_better_map_and_leaves_the_run_alone(
     assert {path.name for path in (tmp_path / 'refined').iterdir()} == set(before)
 
 
+def test_refine_may_add_gaussians(run: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('splatam_core.refinement.GROW_FROM', 20)
+    monkeypatch.setattr('splatam_core.refinement.GROW_EVERY', 20)
+    steps = ['--iterations', 100]
+    assert splatam('refine', run.path, '--out', tmp_path / 'same', *steps) == 0
+    assert splatam('refine', run.path, '--out', tmp_path / 'grown', *steps, '--densify') == 0
+    same, grown = (len(read_ply(tmp_path / name / 'map.ply')) for name in ('same', 'grown'))
+    assert same <= len(run.read_map()) < grown
+    assert read_run(tmp_path / 'grown').trajectory.stamps_ns.tolist() == run.trajectory.stamps_ns.tolist()
+
+
 def test_refine_does_not_look_at_held_out_frames(run: RunRecord) -> None:
     stamps_ns = [frame.stamp_ns for frame in run.frames]
     assert sorted(run.mapped_poses()) == [stamps_ns[index] for index in (0, 1, 3, 4)]
