@@ -8,6 +8,7 @@
     metrics.json     the numbers; null until evaluated
     config.yaml      every setting
     run.json         source, camera, commit, machine, versions
+    scores.csv       written by the evaluation: one line a view
     report.png       drawn by the evaluation: one picture
     report.html      drawn by the evaluation: one page that needs nothing else
     checkpoints/     to go on from, see checkpoints.py
@@ -51,9 +52,10 @@ MAP = 'map.ply'
 METRICS = 'metrics.json'
 CONFIG = 'config.yaml'
 RUN = 'run.json'
+SCORES = 'scores.csv'
 REPORT = 'report.png'
 PAGE = 'report.html'
-FILES = (TRAJECTORY, FRAMES, MAP, METRICS, CONFIG, RUN, REPORT, PAGE)
+FILES = (TRAJECTORY, FRAMES, MAP, METRICS, CONFIG, RUN, SCORES, REPORT, PAGE)
 CHECKPOINTS = 'checkpoints'
 PREVIOUS = 'previous'
 LOST = '# lost '
@@ -508,7 +510,7 @@ def trim_run(path: Path, num_frames: int, last_stamp_ns: int | None) -> None:
             found = stamp_from_text(line.replace(',', ' ').split()[0])
             if found != last_stamp_ns or not line.endswith('\n'):
                 raise RunFolderError(f'{name} has frame {found} ns in line {num_frames}, expected {last_stamp_ns} ns')
-        for name in (MAP, METRICS, REPORT, PAGE):
+        for name in (MAP, METRICS, SCORES, REPORT, PAGE):
             (path / name).unlink(missing_ok=True)
         replace_text(path / TRAJECTORY, ''.join(trajectory))
         replace_text(path / FRAMES, ''.join(frames))

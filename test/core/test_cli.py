@@ -87,7 +87,7 @@ def of_the_node(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_run_writes_everything(finished: Path) -> None:
     names = {'trajectory.txt', 'frames.csv', 'map.ply', 'metrics.json', 'config.yaml', 'run.json', 'report.png'}
-    names |= {'report.html'}
+    names |= {'report.html', 'scores.csv'}
     assert {entry.name for entry in finished.iterdir()} == names
     assert len((finished / 'trajectory.txt').read_text().splitlines()) == FRAMES
     run = read_run(finished)
