@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from splatam_core.commands import ablations, bench, compare, convert, evaluate, export, refine, render
 from splatam_core.commands.evaluate import print_summary, score_own_run
-from splatam_core.commands.shared import Command, add_source_arguments, open_source, positive, say, source_of
+from splatam_core.commands.shared import Command, add_source_arguments, at_width, open_source, positive, say, source_of
 from splatam_core.errors import DatasetError, FrameError, RunFolderError, SplatamError
 
 # Whatever takes time to import (torch, OpenCV, matplotlib) is imported by the command that needs it.
@@ -140,7 +140,7 @@ def _begin(args: argparse.Namespace) -> _Job:
     held_out = [f'mapping.hold_out={args.holdout}'] if args.holdout else []
     config = load_config(args.preset, [*args.set, *held_out])
     apply_threads(config)
-    source = source_of(args)
+    source = at_width(source_of(args), config)
     sequence, slam = prepare(open_source(source), config)
     every, keep = args.checkpoint_every, args.keep_checkpoints or KEEP_CHECKPOINTS
     description = RunDescription('splatam run', args.preset, source, every, keep)

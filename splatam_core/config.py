@@ -255,6 +255,9 @@ class SlamConfig:
     """Everything that can be set about SLAM. The defaults are the paper's for Replica."""
 
     seed: int = _setting(0, 'Seed of every random choice.', '', 0)
+    width: int = _setting(
+        0, "Of 'splatam run' without --width: wider frames are resized to this width; 0 = as recorded.", 'px', 0
+    )
     threads: int = _setting(0, 'CPU threads; 0 = all cores, 1 = repeatable bit for bit.', '', 0, 256)
     rasterizer: str = _setting('cpu', 'Rasterizer backend.', choices=('cpu', 'reference'))
     depth: DepthConfig = field(default_factory=DepthConfig)

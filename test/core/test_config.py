@@ -59,6 +59,7 @@ def test_what_all_of_the_originals_configurations_share(preset: str) -> None:
     assert (m.reset_opacity_every, m.anisotropic, m.optimizer, m.hold_out) == (0, False, 'autograd', 0)
     assert (k.selection, k.overlap_samples, k.overlap_margin) == ('overlap', 1600, 20)
     assert (m.scene_radius_ratio, k.at_least) == (2.0 if preset == 'tum' else 3.0, 5 if preset == 'iphone' else 0)
+    assert config.width == {'scannet': 640, 'scannetpp': 876, 'iphone': 960}.get(preset, 0)
     assert (t.scale, d.scale) == (1.0, 0.5 if preset in ('splatam_s', 'iphone') else 1.0)
 
 
