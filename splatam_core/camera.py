@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from splatam_core.errors import CameraError, FrameError
+from splatam_core.errors import CameraError, FrameError, one_line
 from splatam_core.types import RgbdFrame
 
 DISTORTION_COEFFICIENTS = {
@@ -137,7 +137,7 @@ def read_camera_file(path: Path) -> CameraFile:
     try:
         values = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise CameraError(f'{path}: cannot be read: {error}') from None
+        raise CameraError(f'{path}: cannot be read: {one_line(error)}') from None
     if not isinstance(values, dict):
         raise CameraError(f'{path}: expected a mapping with width, height, fx, fy, cx, cy')
     required = {'width', 'height', 'fx', 'fy', 'cx', 'cy'}

@@ -19,6 +19,7 @@ from splatam_core.commands.shared import (
     Command,
     add_device_argument,
     add_source_arguments,
+    at_width,
     open_source,
     positive,
     say,
@@ -149,7 +150,7 @@ def _begin(args: argparse.Namespace) -> _Job:
     given = {'mapping.hold_out': args.holdout, 'device': args.device}
     config = load_config(args.preset, [*args.set, *(f'{name}={value}' for name, value in given.items() if value)])
     apply_threads(config)
-    source = source_of(args)
+    source = at_width(source_of(args), config)
     sequence, slam = prepare(open_source(source), config)
     _say_where(slam)
     every, keep = args.checkpoint_every, args.keep_checkpoints or KEEP_CHECKPOINTS

@@ -15,7 +15,7 @@ from typing import Any, Union, get_type_hints
 
 import yaml
 
-from splatam_core.errors import ConfigError
+from splatam_core.errors import ConfigError, one_line
 from splatam_core.resources import config_dir
 
 Value = Union[bool, int, float, str]
@@ -136,6 +136,10 @@ class TrackingConfig:
     depth_outlier_ratio: float = _setting(
         0.0, "Of the paper's tracker: pixels count up to this many median depth errors; 0 = all.", '', 0.0
     )
+    blended_depth: bool = _setting(
+        False, "Of the paper's tracker: compare the blended depth, short where the map is thin, as the original does, and not "
+        'the expected one.',
+    )  # fmt: skip
     motion_model: str = _setting(
         'constant_velocity', 'Where tracking starts from.', choices=('constant_velocity', 'last_pose')
     )
@@ -228,9 +232,18 @@ class MappingConfig:
     scale_rate: float = _setting(1e-3, 'Adam step of the log scales.', '', 0.0)
     rotation_rate: float = _setting(1e-3, "Adam step of anisotropic Gaussians' unit quaternions.", '', 0.0)
     prune_every: int = _setting(20, 'Prune before every n-th step of a frame; 0 = never.', 'steps', 0)
-    prune_until: int = _setting(20, 'Last step of a frame that may prune.', 'steps', 0)
+    prune_from: int = _setting(0, 'First step of a frame that may prune. Not of fused fitting.', 'steps', 0)
+    prune_until: int = _setting(20, 'Last step of a frame that may prune or reset opacities. Not of fused fitting.', 'steps', 0)
     prune_opacity: float = _setting(0.005, 'Prune Gaussians fainter than this.', '', 0.0, 1.0)
+    prune_last_opacity: float = _setting(
+        0.0, 'The same at step prune_until; 0 = as at the others. Not of fused fitting.', '', 0.0, 1.0
+    )
     prune_scale: float = _setting(0.1, 'Prune Gaussians wider than this share of the scene radius.', '', 0.0)
+    prune_scale_from: int = _setting(0, 'First step of a frame that prunes wide ones too. Not of fused fitting.', 'steps', 0)
+    reset_opacity_every: int = _setting(
+        0, 'Make all Gaussians 1 % opaque before every n-th step of a frame but the first; 0 = never. Not of fused fitting.',
+        'steps', 0,
+    )  # fmt: skip
     prune_share: float = _setting(
         0.0, 'Of fused fitting: prune only once this share of the map is to go; the map is copied then.', '', 0.0, 1.0
     )
@@ -250,6 +263,9 @@ class SlamConfig:
     """Everything that can be set about SLAM. The defaults are the paper's for Replica."""
 
     seed: int = _setting(0, 'Seed of every random choice.', '', 0)
+    width: int = _setting(
+        0, "Of 'splatam run' without --width: wider frames are resized to this width; 0 = as recorded.", 'px', 0
+    )
     threads: int = _setting(0, 'CPU threads; 0 = all cores, 1 = repeatable bit for bit.', '', 0, 256)
     device: str = _setting(
         'auto', 'Where maps live and are computed; auto = on a GPU where torch sees one and triton is there, else cpu.',
@@ -340,14 +356,21 @@ def with_values(config: SlamConfig, values: Mapping[str, object]) -> SlamConfig:
             'mapping.anisotropic = true: fused fitting knows isotropic Gaussians only; set it to false, or '
             'mapping.optimizer=autograd'
         )
-    if config.mapping.optimizer == 'fused' and config.mapping.depth_outlier_ratio > 0:
-        raise ConfigError('mapping.depth_outlier_ratio: fused fitting has none; set it to 0, or mapping.optimizer=autograd')
+    if config.mapping.optimizer == 'fused':
+        _check_fused(config.mapping)
     return config
 
 
 def computed_on(config: SlamConfig, device: str | None) -> SlamConfig:
     """The same SLAM on another device, by that device's own rasterizer; as it was where none is named."""
     return config if device is None else with_values(config, {'device': device, 'rasterizer': 'auto'})
+
+
+def _check_fused(config: MappingConfig) -> None:
+    """Make sure that nothing is asked of fused fitting that it does not do."""
+    for name in ('depth_outlier_ratio', 'prune_from', 'prune_last_opacity', 'prune_scale_from', 'reset_opacity_every'):
+        if getattr(config, name) > 0:
+            raise ConfigError(f'mapping.{name}: fused fitting has none; set it to 0, or mapping.optimizer=autograd')
 
 
 def flat_values(config: SlamConfig) -> dict[str, Value]:
@@ -385,7 +408,7 @@ def _read_preset(preset: str) -> dict[str, Any]:
     try:
         values = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f'{path}: cannot be read: {error}') from None
+        raise ConfigError(f'{path}: cannot be read: {one_line(error)}') from None
     if not isinstance(values, (dict, type(None))):
         raise ConfigError(f'{path}: expected a mapping of settings')
     return values or {}

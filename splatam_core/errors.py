@@ -39,3 +39,8 @@ class ExportError(SplatamError):
 
 class CheckpointError(SplatamError):
     """A checkpoint that is missing, damaged, or of another run."""
+
+
+def one_line(error: Exception) -> str:
+    """What another library's error says, without its line breaks."""
+    return ' '.join(str(error).split())

@@ -1,8 +1,8 @@
-"""Maps for other programs: a coloured point cloud, and a mesh of the fused renders."""
+"""Maps for other programs: a coloured point cloud, a mesh of the fused renders, the original's ``params.npz``."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -105,6 +105,52 @@ def fused_mesh(
 def _open3d() -> Any:
     try:
         import open3d
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise ExportError(f"a mesh needs Open3D ({error}): pip install 'splatam_ros[mesh]'") from None
+    except (ImportError, OSError) as error:  # its wheel expects some of the system's libraries
+        raise ExportError(
+            f'a mesh needs Open3D, which is installed but does not load: {error}; on Debian and Ubuntu: apt install '
+            'libusb-1.0-0 libgl1 libgomp1'
+        ) from None
     return open3d
+
+
+def splatam_params(
+    gaussians: Gaussians, camera: PinholeCamera, poses: NDArray[np.float64], keyframes: Sequence[int],
+    true_poses: NDArray[np.float64],
+) -> dict[str, NDArray[np.generic]]:  # fmt: skip
+    """What the original's ``params.npz`` holds, for its viewers and scripts.
+
+    Not known to a finished map is when each Gaussian was added: ``timestep`` is 0 throughout, as after the original
+    resumes, so that its replay shows all of the map from the start. K counts from the pixels' centres, as here.
+
+    Args:
+        gaussians: the map.
+        camera: of the frames.
+        poses: [T, 4, 4] T_world_cam of the tracked frames.
+        keyframes: indices among them.
+        true_poses: [T, 4, 4] T_world_cam in any world; NaN where not known.
+
+    Returns:
+        float32 arrays by the original's names; poses are world to camera, T in the last axis.
+    """
+    g = gaussians.detached()
+    rotations = np.tile([1.0, 0.0, 0.0, 0.0], (len(g), 1)) if g.rotations is None else g.rotations.numpy()
+    T_cam_world = se3.inverse(poses)
+    quaternions = np.array([se3.quaternion_from_rotation(T[:3, :3]) for T in T_cam_world]).reshape(-1, 4)
+    arrays = {
+        'means3D': g.means.numpy(), 'rgb_colors': g.rgb.numpy(), 'unnorm_rotations': rotations,
+        'logit_opacities': g.logit_opacities.numpy()[:, None], 'log_scales': g.log_scales.numpy(),
+        'cam_unnorm_rots': quaternions.T[None], 'cam_trans': T_cam_world[:, :3, 3].T[None], 'timestep': np.zeros(len(g)),
+        'intrinsics': camera.matrix, 'w2c': np.eye(4), 'gt_w2c_all_frames': _relative_to_first(true_poses),
+    }  # fmt: skip
+    size = {'org_width': np.array(camera.width), 'org_height': np.array(camera.height)}
+    indices = {'keyframe_time_indices': np.array(keyframes, np.int64)}
+    return {name: np.asarray(values, np.float32) for name, values in arrays.items()} | size | indices
+
+
+def _relative_to_first(true_poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[T, 4, 4] world to camera, the world being the first camera; all NaN where the first is not known."""
+    if len(true_poses) == 0:
+        return true_poses
+    return se3.inverse(true_poses) @ true_poses[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -139,6 +140,31 @@ class GaussianMap:
         self._optimizer.step()
         self._optimizer.zero_grad(set_to_none=True)
 
+    def extend(self, new: Gaussians) -> None:
+        """Add Gaussians to an optimisation under way; moments of the others stay, gradients go.
+
+        Raises:
+            RasterizerError: anisotropic ones, to an isotropic map.
+        """
+        assert self._optimizer is not None
+        rates = Rates(**{name: group['lr'] for name, group in zip(self._names, self._optimizer.param_groups)})
+        states = {name: self._optimizer.state.get(getattr(self, name)) for name in self._names}
+        self.append(new)
+        self.start_optimization(rates)
+        for name, state in states.items():
+            if state:
+                self._optimizer.state[getattr(self, name)] = {key: _padded(value, len(new)) for key, value in state.items()}
+
+    def set_opacities(self, opacity: float) -> None:
+        """Give all the same opacity, in (0, 1); what their logits' gradients and moments have collected is forgotten."""
+        logits = self.logit_opacities
+        with torch.no_grad():
+            logits.fill_(math.log(opacity / (1 - opacity)))
+        logits.grad = None
+        if self._optimizer is not None and (state := self._optimizer.state.get(logits)):
+            for name in ('exp_avg', 'exp_avg_sq'):
+                state[name].zero_()
+
     def stop_optimization(self) -> None:
         """Cut the parameters off from autograd."""
         if self._optimizer is not None:
@@ -225,6 +251,11 @@ def block_bounds_by_torch(means: Tensor, log_scales: Tensor) -> Tensor:
 
 def _host_copy(values: Tensor) -> NDArray[Any]:
     return values.detach().to('cpu', copy=True).numpy()
+
+
+def _padded(value: Tensor, count: int) -> Tensor:
+    """Moments with zeros for so many new Gaussians; what is none, a count of steps, as it is."""
+    return torch.cat([value, value.new_zeros(count, *value.shape[1:])]) if value.ndim else value
 
 
 def _replace_parameter(optimizer: torch.optim.Adam, old: Tensor, new: Tensor, kept: Tensor) -> None:

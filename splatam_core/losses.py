@@ -35,7 +35,7 @@ def tracking_loss(render: Render, view: View, config: TrackingConfig) -> Trackin
     Without the silhouette's mask depth counts at every reading, and colour at every pixel, map or not.
     """
     counts = view.valid & (render.silhouette.detach() > config.silhouette_threshold) if config.use_silhouette else view.valid
-    error = (expected_depth(render) - view.depth).abs()
+    error = ((render.depth_acc if config.blended_depth else expected_depth(render)) - view.depth).abs()
     if config.depth_outlier_ratio > 0:
         counts = inliers(error.detach(), counts, config.depth_outlier_ratio)
     mask = counts.to(view.rgb.dtype)

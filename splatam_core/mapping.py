@@ -14,6 +14,9 @@ from splatam_core.keyframes import PosedView, draw
 from splatam_core.losses import mapping_loss
 from splatam_core.rasterizer import Rasterizer, Rates, Target
 
+RESET_OPACITY = 0.01
+"""What the original makes of all opacities (``reset_opacities``), as 3D Gaussian splatting does."""
+
 
 def refine(
     gaussian_map: GaussianMap,
@@ -53,10 +56,20 @@ def _fit_by_autograd(
     for step, posed in enumerate(views):
         render = rasterizer.render(gaussian_map.gaussians, posed.view.camera, posed.T_cam_world)
         mapping_loss(render, posed.view, config).backward()
-        if config.prune_every and step % config.prune_every == 0 and step <= config.prune_until:
-            gaussian_map.keep(~prunable(gaussian_map, config, scene_radius))
+        if step <= config.prune_until:
+            _tidy_up(gaussian_map, config, scene_radius, step)
         gaussian_map.step()
     gaussian_map.stop_optimization()
+
+
+def _tidy_up(gaussian_map: GaussianMap, config: MappingConfig, scene_radius: float, step: int) -> None:
+    if config.prune_every and step % config.prune_every == 0 and step >= config.prune_from:
+        last = step == config.prune_until and config.prune_last_opacity > 0
+        min_opacity = config.prune_last_opacity if last else config.prune_opacity
+        max_scale = config.prune_scale * scene_radius if step >= config.prune_scale_from else math.inf
+        gaussian_map.keep(~prunable(gaussian_map, min_opacity, max_scale))
+    if config.reset_opacity_every and step > 0 and step % config.reset_opacity_every == 0:
+        gaussian_map.set_opacities(RESET_OPACITY)
 
 
 def _fit_fused(
@@ -70,15 +83,15 @@ def _fit_fused(
         )
         rasterizer.fit(gaussian_map.gaussians, gaussian_map.moments, rates(config), target)
     if config.prune_every:
-        chosen = prunable(gaussian_map, config, scene_radius)
+        chosen = prunable(gaussian_map, config.prune_opacity, config.prune_scale * scene_radius)
         if chosen.sum() > config.prune_share * len(gaussian_map):
             gaussian_map.keep(~chosen)
 
 
-def prunable(gaussian_map: GaussianMap, config: MappingConfig, scene_radius: float) -> Tensor:
+def prunable(gaussian_map: GaussianMap, min_opacity: float, max_scale_m: float) -> Tensor:
     """[N] Gaussians that are too faint to matter or too wide to be surface."""
-    faint = gaussian_map.logit_opacities.detach() < _logit(config.prune_opacity)
-    wide = gaussian_map.log_scales.detach().amax(dim=1) > _log(config.prune_scale * scene_radius)
+    faint = gaussian_map.logit_opacities.detach() < _logit(min_opacity)
+    wide = gaussian_map.log_scales.detach().amax(dim=1) > _log(max_scale_m)
     return faint | wide
 
 

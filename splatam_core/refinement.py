@@ -1,6 +1,7 @@
 """Offline optimisation of a finished map: every frame again and again, poses fixed, step sizes fading.
 
-The original's ``post_splatam_opt.py`` does the same, with the same losses as in mapping.
+The original's ``post_splatam_opt.py`` does the same, with the same losses as in mapping, and may add Gaussians as
+``growth`` does. Over a run of ``tracking.method: truth`` it is 3D Gaussian splatting with known poses.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ from splatam_core.config import SlamConfig
 from splatam_core.datasets.base import Sequence, frame_or_none
 from splatam_core.errors import RunFolderError
 from splatam_core.gaussian_map import GaussianMap
+from splatam_core.growth import ScreenPull, grow
 from splatam_core.keyframes import PosedView
 from splatam_core.losses import mapping_loss
-from splatam_core.mapping import prunable, rates
+from splatam_core.mapping import RESET_OPACITY, prunable, rates
 from splatam_core.rasterizer import Gaussians, Rasterizer, Rates
 from splatam_core.view import View
 
@@ -27,6 +29,11 @@ LAST_RATE = 0.01
 """Of the step sizes at the end, relative to the beginning."""
 
 PRUNE_EVERY = 500
+GROW_FROM, GROW_EVERY, GROW_UNTIL = 500, 100, 0.5
+"""Steps; the last is a share of all steps, after which the new ones settle."""
+
+RESET_EVERY = 3000
+"""Steps after which a map that grows is made transparent, so that what nobody needs stays so and is pruned."""
 
 
 def refine_map(
@@ -37,6 +44,7 @@ def refine_map(
     config: SlamConfig,
     iterations: int,
     progress: Callable[[range], Iterable[int]],
+    densify: bool = False,
 ) -> Gaussians:
     """Fit a map to the frames of a run.
 
@@ -48,26 +56,59 @@ def refine_map(
         config: the run's; weights, rates and pruning are those of its mapping.
         iterations: steps, one frame each.
         progress: wraps the loop over the steps.
+        densify: whether to add Gaussians in the first half of the steps.
 
     Raises:
         RunFolderError: none of the poses is that of a frame.
     """
     gaussian_map = GaussianMap(gaussians.rotations is not None, gaussians.means.device)
     gaussian_map.append(gaussians.detached())
-    views = _endless(sequence, poses, config)
-    first = next(views)
-    scene_radius = float(first.view.depth.max()) / config.mapping.scene_radius_ratio
-    gaussian_map.start_optimization(rates(config.mapping))
+    views, mapping = _endless(sequence, poses, config), config.mapping
+    posed = next(views)
+    scene_radius = float(posed.view.depth.max()) / mapping.scene_radius_ratio
+    growth = _Growth(gaussian_map, scene_radius, iterations, config.seed) if densify else None
+    gaussian_map.start_optimization(rates(mapping))
     for step in progress(range(iterations)):
-        posed, weights = next(views).to(gaussians.means.device), config.mapping
-        gaussian_map.set_rates(_faded(rates(weights), LAST_RATE ** (step / iterations)))
+        posed = next(views).to(gaussians.means.device)
+        gaussian_map.set_rates(_faded(rates(mapping), LAST_RATE ** (step / iterations)))
         render = rasterizer.render(gaussian_map.gaussians, posed.view.camera, posed.T_cam_world)
-        mapping_loss(render, posed.view, weights).backward()
-        if weights.prune_every and step % PRUNE_EVERY == 0:
-            gaussian_map.keep(~prunable(gaussian_map, weights, scene_radius))
+        mapping_loss(render, posed.view, mapping).backward()
+        if growth is not None:
+            growth.observe(posed)
+        if mapping.prune_every and step % PRUNE_EVERY == 0:
+            kept = ~prunable(gaussian_map, mapping.prune_opacity, mapping.prune_scale * scene_radius)
+            gaussian_map.keep(kept)
+            if growth is not None:
+                growth.pull.keep(kept)
         gaussian_map.step()
+        if growth is not None:
+            growth.after(step)
     gaussian_map.stop_optimization()
     return gaussian_map.gaussians.detached()
+
+
+class _Growth:
+    """When a map grows."""
+
+    def __init__(self, gaussian_map: GaussianMap, scene_radius: float, iterations: int, seed: int) -> None:
+        self.pull = ScreenPull(len(gaussian_map))
+        self._map, self._scene_radius, self._until = gaussian_map, scene_radius, GROW_UNTIL * iterations
+        self._rng = np.random.default_rng(seed)
+
+    def observe(self, posed: PosedView) -> None:
+        """Look at the gradients of a view."""
+        means = self._map.means
+        self.pull.observe(means.grad, means.detach(), posed.view.camera, posed.T_cam_world)
+
+    def after(self, step: int) -> None:
+        """Grow, or make transparent, where it is time to."""
+        if step > self._until or step == 0:
+            return
+        if step >= GROW_FROM and step % GROW_EVERY == 0:
+            grow(self._map, self.pull.mean(), self._scene_radius, self._rng)
+            self.pull = ScreenPull(len(self._map))
+        if step % RESET_EVERY == 0:
+            self._map.set_opacities(RESET_OPACITY)
 
 
 def _faded(rates: Rates, factor: float) -> Rates:

@@ -8,6 +8,7 @@
     metrics.json     the numbers; null until evaluated
     config.yaml      every setting
     run.json         source, camera, commit, machine, versions
+    scores.csv       written by the evaluation: one line a view
     report.png       drawn by the evaluation: one picture
     report.html      drawn by the evaluation: one page that needs nothing else
     checkpoints/     to go on from, see checkpoints.py
@@ -52,9 +53,10 @@ MAP = 'map.ply'
 METRICS = 'metrics.json'
 CONFIG = 'config.yaml'
 RUN = 'run.json'
+SCORES = 'scores.csv'
 REPORT = 'report.png'
 PAGE = 'report.html'
-FILES = (TRAJECTORY, FRAMES, MAP, METRICS, CONFIG, RUN, REPORT, PAGE)
+FILES = (TRAJECTORY, FRAMES, MAP, METRICS, CONFIG, RUN, SCORES, REPORT, PAGE)
 CHECKPOINTS = 'checkpoints'
 PREVIOUS = 'previous'
 LOST = '# lost '
@@ -412,7 +414,7 @@ class RunRecord:
             raise RunFolderError(f'{self.path}: {error}') from None
 
 
-def write_refined(run: RunRecord, path: Path, gaussians: Gaussians, iterations: int) -> None:
+def write_refined(run: RunRecord, path: Path, gaussians: Gaussians, iterations: int, densified: bool = False) -> None:
     """Write a run's folder anew with another map; scores of images are gone, the rest is as it was.
 
     Args:
@@ -420,6 +422,7 @@ def write_refined(run: RunRecord, path: Path, gaussians: Gaussians, iterations: 
         path: the new folder.
         gaussians: the new map.
         iterations: how many steps were taken from the old one.
+        densified: whether they added Gaussians.
 
     Raises:
         RunFolderError: something is at the path, or it cannot be written.
@@ -427,7 +430,7 @@ def write_refined(run: RunRecord, path: Path, gaussians: Gaussians, iterations: 
     information = json.loads((run.path / RUN).read_text())
     information |= {
         'program': 'splatam refine', 'refined_from': str(run.path.resolve()), 'refined_iterations': iterations,
-        'started': _now(), 'commit': environment.commit(), 'machine': environment.machine(),
+        'refined_densified': densified, 'started': _now(), 'commit': environment.commit(), 'machine': environment.machine(),
         'versions': environment.versions(),
     }  # fmt: skip
     check_is_free(path)
@@ -525,7 +528,7 @@ def trim_run(path: Path, num_frames: int, last_stamp_ns: int | None) -> None:
             found = stamp_from_text(line.replace(',', ' ').split()[0])
             if found != last_stamp_ns or not line.endswith('\n'):
                 raise RunFolderError(f'{name} has frame {found} ns in line {num_frames}, expected {last_stamp_ns} ns')
-        for name in (MAP, METRICS, REPORT, PAGE):
+        for name in (MAP, METRICS, SCORES, REPORT, PAGE):
             (path / name).unlink(missing_ok=True)
         replace_text(path / TRAJECTORY, ''.join(trajectory))
         replace_text(path / FRAMES, ''.join(frames))

@@ -158,6 +158,7 @@ FIXED = {
     'width': 'frames of another size are those of another camera',
     'max_path_poses': 'the path so far is thinned out by it',
     'slam.seed': 'it is where the random choices of this map started',
+    'slam.width': "it is of 'splatam run'; the node's own is width",
     'slam.threads': 'the threads are running',
     'slam.device': 'the map is there',
     'slam.rasterizer': 'it is made when the node starts',

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatam_core.commands.shared import Command, add_source_arguments, open_source, say, source_of, source_words
+from splatam_core.commands.shared import Command, add_source_arguments, at_width, open_source, say, source_of, source_words
 
 if TYPE_CHECKING:
     from splatam_core.run_folder import Source
@@ -25,7 +25,7 @@ def ablations(args: argparse.Namespace) -> int:
     from splatam_core.ablations import provenance, run, table, variant_names, variants
 
     chosen = variants(args.only or variant_names(), args.preset, args.set)
-    source = source_of(args)
+    source = at_width(source_of(args), chosen[0].config)
     open_source(source)
     folders = {variant.name: args.out / variant.name for variant in chosen}
     for number, variant in enumerate(chosen, 1):

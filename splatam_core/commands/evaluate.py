@@ -59,17 +59,19 @@ def evaluate(args: argparse.Namespace) -> int:
 def score(
     run: RunRecord, truth: Trajectory | None, sequence: Sequence | None, every: int, novel: NovelViews | None = None
 ) -> Metrics:
-    """Score, then write ``metrics.json`` and the reports; an error leaves them as they are."""
+    """Score, then write ``metrics.json``, ``scores.csv`` and the reports; an error leaves them as they are."""
+    from splatam_core.evaluation.frame_table import write_frame_table
     from splatam_core.evaluation.html import write_html
     from splatam_core.evaluation.report import write_report
     from splatam_core.evaluation.score import combine, score_images, score_trajectory
     from splatam_core.files import replace_text
-    from splatam_core.run_folder import METRICS, PAGE, REPORT
+    from splatam_core.run_folder import METRICS, PAGE, REPORT, SCORES
 
     against_truth = None if truth is None else score_trajectory(run, truth)
     against_images = None if sequence is None else score_images(run, sequence, every, progress('scoring'))
     evaluation = combine(run, against_truth, against_images, novel)
     replace_text(run.path / METRICS, evaluation.metrics.to_json())
+    write_frame_table(evaluation, run.path / SCORES)
     write_report(evaluation, run.path / REPORT)
     write_html(evaluation, run.path / PAGE)
     return evaluation.metrics

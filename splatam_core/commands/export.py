@@ -6,24 +6,27 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatam_core.commands.shared import Command, add_run_argument, open_run, positive, progress
+from splatam_core.commands.shared import Command, add_run_argument, open_run, open_source, positive, progress
 from splatam_core.errors import ExportError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from splatam_core.export import Surface
     from splatam_core.rasterizer import Gaussians
     from splatam_core.run_folder import RunRecord
 
-FORMS = ('gaussians', 'points', 'mesh')
+FORMS = ('gaussians', 'points', 'mesh', 'splatam')
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_run_argument(parser)
-    parser.add_argument('file', type=Path, metavar='FILE', help='the .ply file to write')
+    parser.add_argument('file', type=Path, metavar='FILE', help='the file to write: .ply, or .npz of --as splatam')
     parser.add_argument(
         '--as', dest='form', choices=FORMS, default='gaussians',
         help="'gaussians' for splat viewers (default), 'points' for coloured centres, 'mesh' for the surface fused from "
-        "rendered depth (pip install 'splatam_ros[mesh]')",
+        "rendered depth (pip install 'splatam_ros[mesh]'), 'splatam' for the original's params.npz",
     )  # fmt: skip
     parser.add_argument('--overwrite', action='store_true', help='replace FILE')
     parser.add_argument(
@@ -60,8 +63,9 @@ def export(args: argparse.Namespace) -> int:
     from splatam_core.export import centres
     from splatam_core.ply import write_ply, write_surface
 
-    if args.file.suffix.lower() != '.ply':
-        raise ExportError(f"{args.file}: '{args.file.suffix}' files are not written; name it .ply")
+    suffix = '.npz' if args.form == 'splatam' else '.ply'
+    if args.file.suffix.lower() != suffix:
+        raise ExportError(f"{args.file}: '{args.file.suffix}' files are not written; name it {suffix}")
     if args.file.exists() and not args.overwrite:
         raise ExportError(f'{args.file} exists: choose another name, or replace it with --overwrite')
     run = open_run(args.dir, args.device)
@@ -70,6 +74,10 @@ def export(args: argparse.Namespace) -> int:
         if args.form == 'gaussians':
             write_ply(args.file, gaussians)
             print(f'{len(gaussians)} Gaussians are in {args.file}')
+            return 0
+        if args.form == 'splatam':
+            _write_splatam(args.file, run, gaussians)
+            print(f'{len(gaussians)} Gaussians and {len(run.trajectory)} poses are in {args.file}')
             return 0
         surface = centres(gaussians, args.min_opacity) if args.form == 'points' else _mesh(args, run, gaussians)
         write_surface(args.file, surface.points_m, surface.rgb, surface.triangles)
@@ -91,4 +99,34 @@ def _mesh(args: argparse.Namespace, run: RunRecord, gaussians: Gaussians) -> Sur
     )  # fmt: skip
 
 
-COMMAND = Command('export', "write a run's map as Gaussians, points or a mesh", _add_arguments, export)
+def _write_splatam(path: Path, run: RunRecord, gaussians: Gaussians) -> None:
+    import numpy as np
+
+    from splatam_core.export import splatam_params
+    from splatam_core.files import replaced
+    from splatam_core.types import Status
+
+    poses = run.trajectory.T_world_cam
+    tracked = [frame for frame in run.frames if frame.status is not Status.LOST]
+    keyframes = [index for index, frame in enumerate(tracked) if frame.is_keyframe]
+    arrays = splatam_params(gaussians, run.camera_or_error(), poses, keyframes, _true_poses(run))
+    with replaced(path) as temporary, temporary.open('wb') as file:
+        np.savez(file, **arrays)
+
+
+def _true_poses(run: RunRecord) -> NDArray[np.float64]:
+    """[T, 4, 4] T_world_cam of the tracked frames where the recording knows them; NaN elsewhere."""
+    import numpy as np
+
+    from splatam_core.evaluation.trajectory import interpolate_poses
+
+    source = run.description.source
+    truth = None if source is None else open_source(source).ground_truth()
+    if truth is None:
+        return np.full((len(run.trajectory), 4, 4), np.nan)
+    poses, known = interpolate_poses(truth, run.trajectory.stamps_ns)
+    poses[~known] = np.nan
+    return poses
+
+
+COMMAND = Command('export', "write a run's map as Gaussians, points, a mesh, or for the original's programs", _add_arguments, export)

@@ -15,6 +15,11 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--out', type=Path, required=True, metavar='DIR', help='folder for the refined run')
     parser.add_argument('--iterations', type=positive, default=2000, metavar='N', help='steps (default: %(default)s)')
     parser.add_argument(
+        '--densify', action='store_true',
+        help='clone and split Gaussians where the image pulls at them, in the first half of the steps, as 3D Gaussian '
+        'splatting does; of use from 1000 steps on',
+    )  # fmt: skip
+    parser.add_argument(
         '--every', type=positive, default=1, metavar='N', help='score every n-th frame only, before and after'
     )
 
@@ -37,9 +42,9 @@ def refine(args: argparse.Namespace) -> int:
     before = mean_scores(score_images(run, sequence, args.every, progress('scoring')).frames)
     refined = refine_map(
         gaussians, sequence, run.mapped_poses(), rasterizer, run.config,
-        args.iterations, progress('refining', 'step'),
+        args.iterations, progress('refining', 'step'), args.densify,
     )  # fmt: skip
-    write_refined(run, args.out, refined, args.iterations)
+    write_refined(run, args.out, refined, args.iterations, args.densify)
     metrics = score_own_run(open_run(args.out, args.device), sequence, args.every)
     print_summary(metrics, args.out)
     if before.psnr_db is not None and metrics.psnr_db is not None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from splatam_core.config import DEVICES, computed_on
 
 if TYPE_CHECKING:
+    from splatam_core.config import SlamConfig
     from splatam_core.datasets.base import Sequence
     from splatam_core.run_folder import RunRecord, Source
 
@@ -73,6 +74,18 @@ def source_of(args: argparse.Namespace) -> Source:
         path, args.format, args.start, args.max_frames, args.width, args.rgb, args.depth, args.info,
         args.stride, args.crop, args.split, args.skip_bad,
     )  # fmt: skip
+
+
+def at_width(source: Source, config: SlamConfig) -> Source:
+    """The source at the configuration's width, where none was asked for and its frames are wider.
+
+    Raises:
+        DatasetError, CameraError: it cannot be read.
+    """
+    if source.width is not None or config.width == 0:
+        return source
+    recorded = open_source(source).camera.width + 2 * source.crop
+    return replace(source, width=config.width) if recorded > config.width else source
 
 
 def source_words(source: Source) -> list[str]:

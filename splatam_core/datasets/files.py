@@ -173,12 +173,21 @@ def read_numbers(path: Path) -> NDArray[np.float64]:
     Raises:
         DatasetError: the file cannot be read, or holds something else.
     """
+    if path.suffix == '.npy':
+        return _read_npy(path)
     try:
-        if path.suffix == '.npy':
-            return np.load(path, allow_pickle=False).astype(np.float64).reshape(-1)
         return np.array(path.read_text().split(), dtype=np.float64)
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError) as error:
         raise DatasetError(f'{path}: cannot be read: {error}') from None
+
+
+def _read_npy(path: Path) -> NDArray[np.float64]:
+    try:
+        return np.load(path, allow_pickle=False).astype(np.float64).reshape(-1)
+    except OSError as error:
+        raise DatasetError(f'{path}: cannot be read: {error}') from None
+    except (ValueError, TypeError, EOFError):  # numpy's own message advises to unpickle what may be anything
+        raise DatasetError(f'{path}: is no complete .npy file of numbers; is the copy complete?') from None
 
 
 def read_matrix(path: Path, *sizes: int) -> NDArray[np.float64]:

@@ -63,7 +63,8 @@ def open_sequence(
     if reader.is_path and not Path(source).exists():
         raise DatasetError(f'{source}: there is no such file or folder')
     if not reader.recognises(source):
-        raise DatasetError(f'{source}: {_found(Path(source))}; {reader.name} expects {reader.expects}')
+        nearby = _nearby(Path(source), [reader])
+        raise DatasetError(f'{source}: {_found(Path(source))}; {reader.name} expects {reader.expects}{nearby}')
     _check_options(source, reader, options)
     return cut(reader.open(source, options), options)
 
@@ -87,24 +88,43 @@ def _reader(name: str) -> Format:
 
 
 def _guess(source: str) -> Format:
-    fitting = []
-    for name in READERS:
-        reader = _reader(name)
-        if reader.recognises(source):
-            fitting.append(reader)
-    fitting = [reader for reader in fitting if not reader.is_last_resort] or fitting
+    readers = list(map(_reader, READERS))
+    fitting = _fitting(source, readers)
     if len(fitting) == 1:
         return fitting[0]
     if fitting:
         names = ' and '.join(reader.name for reader in fitting)
         raise DatasetError(f'{source}: looks like {names} at once; choose one with --format')
-    expected = '; '.join(f'{name}: {_reader(name).expects}' for name in READERS)
+    if not Path(source).exists():
+        raise DatasetError(f'{source}: there is no such file or folder')
+    if nearby := _nearby(Path(source), readers):
+        raise DatasetError(f'{source}: {_found(Path(source))}{nearby}')
+    expected = '; '.join(f'{reader.name}: {reader.expects}' for reader in readers)
     raise DatasetError(f'{source}: {_found(Path(source))}. A recording is one of {expected}')
 
 
+def _fitting(source: str, readers: list[Format]) -> list[Format]:
+    """The formats a source looks like; the last resort only where it looks like no other."""
+    fitting = [reader for reader in readers if reader.recognises(source)]
+    return [reader for reader in fitting if not reader.is_last_resort] or fitting
+
+
+def _nearby(path: Path, readers: list[Format], at_most: int = 100) -> str:
+    """What was perhaps meant: something in it, or the folder it is in; nothing where neither is a recording."""
+    inside = sorted(path.iterdir()) if path.is_dir() else []
+    inside = [entry for entry in inside if entry.is_dir() or entry.suffix in ('.bag', '.mcap')][:at_most]
+    guesses = [
+        (reader.is_last_resort, other, reader.name)
+        for other in (*inside, path.resolve().parent)
+        for reader in _fitting(str(other), [reader for reader in readers if reader.is_path])
+    ]
+    if not guesses:
+        return ''
+    _, other, name = min(guesses, key=lambda guess: guess[0])
+    return f'; but {other} looks like {name}: was that meant?'
+
+
 def _found(path: Path, at_most: int = 6) -> str:
-    if not path.exists():
-        return 'there is no such file or folder'
     if not path.is_dir():
         return f"is a '{path.suffix}' file" if path.suffix else 'is a file without a suffix'
     names = sorted(entry.name for entry in path.iterdir())

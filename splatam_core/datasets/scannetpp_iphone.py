@@ -3,7 +3,7 @@
 ::
 
     8b5caf3398/iphone/                  # SOURCE
-        pose_intrinsic_imu.json         # by name (frame_000000): intrinsic (3x3), aligned_pose (4x4)
+        pose_intrinsic_imu.json         # by name (frame_000000): intrinsic (3x3), aligned_pose (4x4; may be missing)
         rgb/frame_000000.jpg            # 1920x1440
         depth/frame_000000.png          # 256x192, 16 bit, millimetres, 0 = no reading
         camera.yaml                     # may be missing; wins over the cameras in the JSON file
@@ -16,9 +16,12 @@ of its own: frames are rectified to the first one's. The numbers in the names co
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatam_core.datasets import base, files
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
@@ -41,7 +44,7 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     size = files.image_size(next(iter(color.values()))) if color else (0, 0)
     with files.parsing(path):
         frames = {number: stated[file.stem] for number, file in color.items()}
-        poses = [files.pose(np.array(frame['aligned_pose'], np.float64), str(path)) for frame in frames.values()]
+        poses = [_pose(frame, f'{path}, {file.stem}') for frame, file in zip(frames.values(), color.values(), strict=True)]
         cameras = {
             number: files.calibration_from_matrix(np.array(frame['intrinsic'], np.float64).reshape(3, 3), size)
             for number, frame in frames.items()
@@ -55,6 +58,11 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
         f'{folder.resolve().parent.name}_iphone', pairs, camera.calibration, depth_format,
         width=width, truth=lambda: trajectory(pairs, poses),
     )  # fmt: skip
+
+
+def _pose(frame: Mapping[str, Any], where: str) -> NDArray[np.float64] | None:
+    """A frame's pose; None where it has none."""
+    return files.pose(np.array(frame['aligned_pose'], np.float64), where) if 'aligned_pose' in frame else None
 
 
 def _recognises(source: str) -> bool:

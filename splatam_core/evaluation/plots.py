@@ -160,7 +160,11 @@ def stage_times(ax: Axes, evaluation: Evaluation) -> None:
         labels=[f'{stage}  {median:.0f} ms' for stage, median in zip(stages, medians)], step='post',
     )  # fmt: skip
     ax.set_xlim(-0.5, len(records) - 0.5)
-    ax.set_ylim(0, max(1e-3, float(np.percentile(times_ms.sum(axis=0), 99)) * 1.35))
+    total_ms = times_ms.sum(axis=0)
+    top_ms = max(1e-3, min(1.35 * float(np.percentile(total_ms, 99)), 2.5 * float(np.percentile(total_ms, 95))))
+    ax.set_ylim(0, top_ms)
+    if total_ms.max() > top_ms:
+        ax.text(1, 1.01, f'slowest {total_ms.max():.0f} ms', transform=ax.transAxes, ha='right', va='bottom', color=MUTED)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     handles, labels = ax.get_legend_handles_labels()
     ax.legend(handles[::-1], labels[::-1], loc='upper left', ncol=2, title='median', title_fontsize=8)

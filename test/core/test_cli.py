@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from splatam_core.cli import COMMANDS, main
+from splatam_core.commands.shared import at_width
 from splatam_core.config import load_config
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.ply import read_ply
@@ -87,7 +88,7 @@ def of_the_node(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_run_writes_everything(finished: Path) -> None:
     names = {'trajectory.txt', 'frames.csv', 'map.ply', 'metrics.json', 'config.yaml', 'run.json', 'report.png'}
-    names |= {'report.html'}
+    names |= {'report.html', 'scores.csv'}
     assert {entry.name for entry in finished.iterdir()} == names
     assert len((finished / 'trajectory.txt').read_text().splitlines()) == FRAMES
     run = read_run(finished)
@@ -121,6 +122,16 @@ def test_run_says_how_it_went(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert f'{FRAMES}/{FRAMES}' in output.err and f'tracked={FRAMES}' in output.err and 'lost=0' in output.err
     assert not (tmp_path / 'run' / 'report.png').exists()
     assert metrics(tmp_path / 'run')['psnr_db'] is None
+
+
+def test_a_configuration_s_width_is_taken_where_none_is_asked_for(tmp_path: Path) -> None:
+    assert splatam('run', SOURCE, '--max-frames', 2, *SETTINGS, '--set', 'width=40', '--no-evaluate', '--out', tmp_path / 'a') == 0
+    run = read_run(tmp_path / 'a')
+    assert (run.camera.width, run.description.source.width) == (40, 40)  # so that it is scored and resumed at that width
+    narrow, wide = load_config('quick', ['width=630']), load_config('quick', ['width=1000'])
+    assert at_width(Source(SOURCE, max_frames=1), wide).width is None  # never wider than recorded
+    assert at_width(Source(SOURCE, max_frames=1, width=48), narrow).width == 48
+    assert at_width(Source(SOURCE, max_frames=1, crop=10), narrow).width == 630  # 640 recorded; cropped after resizing
 
 
 def test_same_run_gives_the_same_poses_and_map(finished: Path, tmp_path: Path) -> None:

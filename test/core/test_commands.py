@@ -248,6 +248,17 @@ def test_refine_makes_a_better_map_and_leaves_the_run_alone(
     assert {path.name for path in (tmp_path / 'refined').iterdir()} == set(before)
 
 
+def test_refine_may_add_gaussians(run: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('splatam_core.refinement.GROW_FROM', 20)
+    monkeypatch.setattr('splatam_core.refinement.GROW_EVERY', 20)
+    steps = ['--iterations', 100]
+    assert splatam('refine', run.path, '--out', tmp_path / 'same', *steps) == 0
+    assert splatam('refine', run.path, '--out', tmp_path / 'grown', *steps, '--densify') == 0
+    same, grown = (len(read_ply(tmp_path / name / 'map.ply')) for name in ('same', 'grown'))
+    assert same <= len(run.read_map()) < grown
+    assert read_run(tmp_path / 'grown').trajectory.stamps_ns.tolist() == run.trajectory.stamps_ns.tolist()
+
+
 def test_refine_does_not_look_at_held_out_frames(run: RunRecord) -> None:
     stamps_ns = [frame.stamp_ns for frame in run.frames]
     assert sorted(run.mapped_poses()) == [stamps_ns[index] for index in (0, 1, 3, 4)]
@@ -291,6 +302,17 @@ def test_export_of_a_mesh_names_its_extra(
     assert not (tmp_path / 'm.ply').exists()
 
 
+def test_export_of_a_mesh_names_the_libraries_that_open3d_lacks(
+    run: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / 'open3d.py').write_text("raise OSError('libusb-1.0.so.0: cannot open shared object file')")
+    monkeypatch.delitem(sys.modules, 'open3d', raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert splatam('export', run.path, tmp_path / 'm.ply', '--as', 'mesh') == 2
+    error = capsys.readouterr().err
+    assert 'libusb-1.0.so.0' in error and 'apt install libusb-1.0-0' in error and 'pip install' not in error
+
+
 def test_exported_mesh_lies_where_the_map_is_seen(run: RunRecord, tmp_path: Path) -> None:
     open3d = pytest.importorskip('open3d')
     arguments = ['--as', 'mesh', '--voxel', 0.03, '--every', 1]
@@ -304,6 +326,29 @@ def test_exported_mesh_lies_where_the_map_is_seen(run: RunRecord, tmp_path: Path
     inside = (u >= 0) & (u < run.camera.width) & (v >= 0) & (v < run.camera.height)
     error_m = np.abs(points[inside, 2] - rendered_m[v[inside], u[inside]])
     assert np.median(error_m) < 0.03  # a voxel
+
+
+def test_export_for_the_original_s_programs(run: RunRecord, tmp_path: Path) -> None:
+    """Names, shapes and kinds of poses as its viewers read them; nothing in the file needs pickle."""
+    assert splatam('export', run.path, tmp_path / 'params.npz', '--as', 'splatam') == 0
+    params = dict(np.load(tmp_path / 'params.npz', allow_pickle=False))
+    gaussians, poses, n = run.read_map(), run.trajectory.T_world_cam, len(run.read_map())
+    shapes = {name: values.shape for name, values in params.items()}
+    assert shapes == {
+        'means3D': (n, 3), 'rgb_colors': (n, 3), 'unnorm_rotations': (n, 4), 'logit_opacities': (n, 1),
+        'log_scales': (n, 1), 'cam_unnorm_rots': (1, 4, FRAMES), 'cam_trans': (1, 3, FRAMES), 'timestep': (n,),
+        'intrinsics': (3, 3), 'w2c': (4, 4), 'org_width': (), 'org_height': (), 'gt_w2c_all_frames': (FRAMES, 4, 4),
+        'keyframe_time_indices': params['keyframe_time_indices'].shape,
+    }  # fmt: skip
+    assert np.array_equal(params['means3D'], gaussians.means) and np.array_equal(params['log_scales'], gaussians.log_scales)
+    for index, T_world_cam in enumerate(poses):
+        T_cam_world = se3.compose(params['cam_unnorm_rots'][0, :, index], params['cam_trans'][0, :, index])
+        assert np.abs(T_cam_world @ T_world_cam - np.eye(4)).max() < 1e-6
+    truth = open_sequence('synthetic', width=WIDTH, max_frames=FRAMES).ground_truth().T_world_cam
+    assert np.allclose(params['gt_w2c_all_frames'][0], np.eye(4), atol=1e-6)
+    assert np.allclose(params['gt_w2c_all_frames'][-1], se3.inverse(truth[FRAMES - 1]) @ truth[0], atol=1e-5)
+    keyframes = [index for index, frame in enumerate(run.frames) if frame.is_keyframe]
+    assert params['keyframe_time_indices'].tolist() == keyframes and keyframes[0] == 0
 
 
 def test_export_refuses_what_it_cannot_write(

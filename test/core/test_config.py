@@ -42,6 +42,27 @@ def test_presets_are_the_originals_configurations(preset, tracking, mapping, win
     assert (config.mapping.every, config.keyframes.every, t.silhouette_threshold) == (1, 5, 0.99)
 
 
+ORIGINALS = ('splatam', 'splatam_s', 'replica', 'replica_v2', 'tum', 'scannet', 'scannetpp', 'iphone')
+
+
+@pytest.mark.parametrize('preset', ORIGINALS)
+def test_what_all_of_the_originals_configurations_share(preset: str) -> None:
+    config = load_config(preset)
+    t, d, k, m = config.tracking, config.densification, config.keyframes, config.mapping
+    assert (t.method, t.motion_model, t.use_silhouette) == ('render_and_compare', 'constant_velocity', True)
+    assert (t.color_weight, t.depth_weight, m.color_weight, m.depth_weight) == (0.5, 1.0, 0.5, 1.0)
+    assert (t.depth_outlier_ratio, m.depth_outlier_ratio, m.ssim_weight) == (0.0, 0.0, 0.2)
+    assert (t.silhouette_threshold, d.silhouette_threshold, d.depth_error_ratio, d.opacity) == (0.99, 0.5, 50.0, 0.5)
+    assert (m.means_rate, m.rgb_rate, m.rotation_rate, m.opacity_rate, m.scale_rate) == (1e-4, 2.5e-3, 1e-3, 0.05, 1e-3)
+    assert (m.prune_from, m.prune_every, m.prune_until, m.prune_scale_from) == (0, 20, 20, 0)
+    assert (m.prune_opacity, m.prune_last_opacity or m.prune_opacity, m.prune_scale) == (0.005, 0.005, 0.1)
+    assert (m.reset_opacity_every, m.anisotropic, m.optimizer, m.hold_out) == (0, False, 'autograd', 0)
+    assert (k.selection, k.overlap_samples, k.overlap_margin) == ('overlap', 1600, 20)
+    assert (m.scene_radius_ratio, k.at_least) == (2.0 if preset == 'tum' else 3.0, 5 if preset == 'iphone' else 0)
+    assert config.width == {'scannet': 640, 'scannetpp': 876, 'iphone': 960}.get(preset, 0)
+    assert (t.scale, d.scale) == (1.0, 0.5 if preset in ('splatam_s', 'iphone') else 1.0)
+
+
 def test_presets_for_far_apart_photographs_track_longer_where_depth_stays_off() -> None:
     """The original's 20000 metres times pixels, at the image sizes it was meant for."""
     assert load_config('scannetpp').tracking.extend_above_m == pytest.approx(20000 / (584 * 876), rel=0.01)
@@ -88,6 +109,8 @@ def test_settings_that_exclude_each_other_are_refused() -> None:
         load_config('realtime', ['mapping.anisotropic=true'])
     with pytest.raises(ConfigError, match='depth_outlier_ratio.*mapping.optimizer=autograd'):
         load_config('realtime', ['mapping.depth_outlier_ratio=10'])
+    with pytest.raises(ConfigError, match='prune_last_opacity: fused fitting has none'):
+        load_config('realtime', ['mapping.prune_last_opacity=0.1'])
 
 
 def test_unknown_preset_lists_the_known() -> None:

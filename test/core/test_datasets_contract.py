@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import logging
 from collections.abc import Callable
 from pathlib import Path
@@ -136,11 +137,32 @@ def test_one_frame_reprojects_into_another(source, layout):
     assert max(share_that_agrees(T) for T in wrong) < right - 0.1
 
 
+POSES = ('transform_matrix', 'aligned_pose', 'pose', 'poses')
+
+
+def without_poses(path: Path) -> bool:
+    """Take the poses out of a JSON file; whether there were any."""
+
+    def stripped(values):
+        if isinstance(values, list):
+            return [stripped(value) for value in values]
+        if isinstance(values, dict):
+            return {name: stripped(value) for name, value in values.items() if name not in POSES}
+        return values
+
+    before = json.loads(path.read_text())
+    path.write_text(json.dumps(after := stripped(before)))
+    return after != before
+
+
 def test_no_truth_is_needed(source, layout):
-    if layout.truth is None:
-        pytest.skip('its poses are in the file with its cameras, or in the bag')
-    removed = [path.unlink() for path in source.glob(layout.truth)]
-    assert removed
+    if layout.format == 'rosbag':
+        pytest.skip('its poses are in the bag; test_datasets_rosbag has bags without')
+    if layout.truth is None:  # its poses are in the file with its cameras
+        assert sum(map(without_poses, source.rglob('*.json')))
+    else:
+        removed = [path.unlink() for path in source.glob(layout.truth)]
+        assert removed
     sequence = read(source, layout)
     assert len(sequence) == 3
     assert sequence[2].rgb.any()
@@ -187,6 +209,19 @@ def test_wrong_folder_says_what_is_expected_and_what_is_there(tmp_path, format):
     assert 'holds holiday.jpg' in str(caught.value)
 
 
+def test_the_folder_above_or_below_says_which_was_meant(layout, tmp_path):
+    """The parent, and a folder inside: what people take by mistake."""
+    (tmp_path / 'downloads' / 'recording').mkdir(parents=True)
+    source = layout.write(tmp_path / 'downloads' / 'recording')
+    inside = [path for path in source.iterdir() if path.is_dir()] if source.is_dir() else []
+    wrong = [path for path in (source.parent, *inside) if not any(_reader(name).recognises(str(path)) for name in READERS)]
+    assert source.parent in wrong
+    for path, options in [(path, options) for path in wrong for options in ({}, {'format': layout.format})]:
+        with pytest.raises(DatasetError) as caught:
+            open_sequence(str(path), **options)
+        assert f'but {source} looks like {layout.format}: was that meant?' in str(caught.value)
+
+
 def test_splits_and_flags_are_refused_where_there_are_none(source, layout):
     reader = _reader(layout.format)
     if not reader.has_splits:
@@ -219,6 +254,8 @@ def write(name: str, folder: Path) -> Path:
         ('folder', 'poses/00001.txt', 'x', r'poses/00001\.txt: cannot be read'),
         ('folder', 'camera.yaml', 'width: 3', r'camera\.yaml: missing cx, cy, fx, fy, height'),
         ('folder realsense', 'camera.yaml', 'pose_axes: up', r'camera\.yaml: missing'),
+        ('folder realsense', 'poses/00001.npy', 'x', r'00001\.npy: is no complete \.npy file of numbers'),
+        ('folder distorted', 'camera.yaml', 'width: 3\ndistorti', r'camera\.yaml: cannot be read: .*scanning'),
         ('folder azure', 'intrinsic.json', '{"width": 96}', r"intrinsic\.json: 'intrinsic_matrix' is missing"),
         ('folder azure', 'trajectory.log', '1 2 3', r'trajectory\.log: expected blocks of 3 \+ 16 numbers'),
         ('folder distorted', 'traj.txt', rows(np.eye(4).reshape(1, 16)), 'has 1 poses for 3 frames'),
@@ -246,8 +283,13 @@ def test_published_cameras():
 def test_published_camera_without_a_camera_file(tmp_path, name, size):
     source = write(name, tmp_path)
     (source / 'camera.yaml').unlink()
-    camera = read(source, LAYOUTS[name]).camera
-    assert (camera.width, camera.height) == size
+    with pytest.raises(DatasetError, match=f'is 96x72, but the camera is that of {size[0]}x{size[1]} images; .*camera.yaml'):
+        read(source, LAYOUTS[name])
+    for path in (*source.rglob('rgb/*.png'), *source.rglob('depth/*.png')):
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), size, interpolation=cv2.INTER_NEAREST))
+    sequence = read(source, LAYOUTS[name])
+    assert (sequence.camera.width, sequence.camera.height) == size
+    assert sequence[2].depth_m.any()
 
 
 def test_scannet_frames_without_a_pose_are_frames_without_truth(tmp_path):

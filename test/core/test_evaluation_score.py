@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import math
 import re
@@ -20,14 +21,16 @@ from splatam_core.camera import PinholeCamera
 from splatam_core.config import load_config
 from splatam_core.errors import FrameError, RunFolderError
 from splatam_core.evaluation.descriptions import DESCRIPTIONS
+from splatam_core.evaluation.frame_table import write_frame_table
 from splatam_core.evaluation.html import html_report
 from splatam_core.evaluation.images import OriginalScores
 from splatam_core.evaluation.metrics import GROUPS, Metrics
 from splatam_core.evaluation.report import DPI, WIDTH_IN, write_report
-from splatam_core.evaluation.score import combine, score_images, score_novel_views, score_trajectory
+from splatam_core.evaluation.score import NovelViews, combine, score_images, score_novel_views, score_trajectory
 from splatam_core.ply import write_ply
 from splatam_core.rasterizer import Gaussians, make_rasterizer
 from splatam_core.run_folder import MAP, RunDescription, RunFolder, RunRecord, Source, read_run
+from splatam_core.trajectory import stamp_from_text
 from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status, Trajectory
 
 CONFIG = load_config('quick', ['threads=1'])
@@ -299,6 +302,24 @@ def test_page_of_hardly_a_run(tmp_path: Path, frames: int) -> None:
             folder.append(Wall()[0], result, 0.01)
     page = check_page(html_report(combine(read_run(tmp_path), None, None)))
     assert f'of {frames}' in page.text
+
+
+def test_the_table_of_frames_is_what_the_means_are_of(tmp_path: Path) -> None:
+    sequence = Wall()
+    run = make_run(tmp_path, sequence)
+    truth, images = score_trajectory(run, sequence.ground_truth()), score_images(run, sequence, 1, plain)
+    novel = NovelViews('first', images.frames[:2], images.frames[2:3], ())
+    evaluation = combine(run, truth, images, novel)
+    write_frame_table(evaluation, tmp_path / 'scores.csv')
+    rows = list(csv.DictReader((tmp_path / 'scores.csv').open()))
+    assert [row['kind'] for row in rows] == ['frame'] * (COUNT - 1) + ['novel'] * 3
+    frames = rows[: COUNT - 1]
+    assert [stamp_from_text(row['stamp']) for row in frames] == [frame.stamp_ns for frame in images.frames]
+    for column, mean in (('psnr_db', evaluation.metrics.psnr_db), ('splatam_depth_l1_m', evaluation.metrics.splatam.depth_l1_m)):
+        assert np.mean([float(row[column]) for row in frames]) == pytest.approx(mean, rel=1e-5)
+    errors = [float(row['position_error_m']) for row in frames]
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(evaluation.metrics.ate_rmse_m, abs=1e-8)
+    assert {row['lpips'] for row in rows} == {''} and rows[-1]['position_error_m'] == ''
 
 
 def test_every_number_is_described_once() -> None:

@@ -46,6 +46,13 @@ def test_tracking_loss_without_the_silhouette_takes_colour_from_everywhere() -> 
     assert float(loss.total) == pytest.approx(depth + 0.5 * 4 * 6 * 3 * 0.1, rel=1e-5)
 
 
+def test_blended_depth_is_short_where_the_map_is_thin() -> None:
+    """At a silhouette of 0.6 the sum of w z is 0.6 of the depth."""
+    render = _render(0.4, 0.6 * 2.0, torch.full((4, 6), 0.6))
+    losses = [tracking_loss(render, _view(), TrackingConfig(silhouette_threshold=0.5, blended_depth=b)) for b in (False, True)]
+    assert [float(loss.depth) for loss in losses] == pytest.approx([0.0, 18 * 0.8], abs=1e-5)
+
+
 def test_losses_leave_out_outliers_of_depth() -> None:
     """One pixel 100 times as far off as the median, which is that of the readings alone."""
     render, view = _render(0.5, 2.1, torch.ones(4, 6)), _view()

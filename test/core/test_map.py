@@ -153,8 +153,51 @@ def test_pruning_drops_the_faint_and_the_wide() -> None:
     gaussian_map = _map(_view())
     gaussian_map.logit_opacities[3] = math.log(0.004 / 0.996)
     gaussian_map.log_scales[5] = math.log(0.11)
-    chosen = prunable(gaussian_map, MappingConfig(), scene_radius=1.0)
+    chosen = prunable(gaussian_map, min_opacity=0.005, max_scale_m=0.1)
     assert torch.nonzero(chosen)[:, 0].tolist() == [3, 5]
+
+
+@pytest.mark.parametrize(
+    ('settings', 'left'),
+    [
+        ({'prune_every': 0}, 768),
+        ({'prune_from': 4}, 768),  # neither step is late enough
+        ({'prune_from': 3, 'prune_scale_from': 5}, 766),  # the two faint ones, at step 3
+        ({'prune_scale_from': 1}, 763),  # those at step 0, the three wide ones at step 3
+        ({'prune_last_opacity': 0.3, 'prune_scale_from': 5}, 762),  # at the last step the four half faint ones too
+        ({'prune_last_opacity': 0.3, 'prune_scale_from': 5, 'prune_until': 4}, 766),  # step 4 is no multiple of 3
+    ],
+)
+def test_pruning_by_its_schedule(settings: dict[str, object], left: int) -> None:
+    """Steps 0 and 3 of four prune; nothing moves in between."""
+    view = _view()
+    gaussian_map = _map(view)
+    gaussian_map.logit_opacities[:2] = -8.0
+    gaussian_map.logit_opacities[2:6] = math.log(0.2 / 0.8)
+    gaussian_map.log_scales[6:9] = math.log(0.11)
+    still = {'means_rate': 0.0, 'rgb_rate': 0.0, 'opacity_rate': 0.0, 'scale_rate': 0.0}
+    values = {'iterations': 5, 'prune_every': 3, 'prune_until': 3} | still | settings
+    config = load_config(overrides={f'mapping.{name}': value for name, value in values.items()})
+    refine(gaussian_map, [PosedView(view, EYE)], make_rasterizer('cpu', 1), config, 1.0, np.random.default_rng(0))
+    assert len(gaussian_map) == left
+
+
+def test_opacities_are_reset_by_their_schedule() -> None:
+    """At steps 2 and 4 all are 1 % opaque again, and step as if it were their first: 0.05 of the logit each."""
+    opacities = []
+    for iterations in (2, 3, 4):
+        gaussian_map = _map(_view())
+        values = {'iterations': iterations, 'reset_opacity_every': 2, 'prune_every': 0}
+        config = load_config(overrides={f'mapping.{name}': value for name, value in values.items()})
+        refine(gaussian_map, [PosedView(_view(), EYE)], make_rasterizer('cpu', 1), config, 1.0, np.random.default_rng(0))
+        opacities.append(torch.sigmoid(gaussian_map.logit_opacities))
+    before, at, after = opacities
+    assert before.min() > 0.3
+    torch.testing.assert_close(at, torch.full_like(at, 0.01))  # nothing is left to step by
+    moved = (torch.logit(after) - math.log(0.01 / 0.99)).abs()
+    # the moments were forgotten, Adam's step count was not: 0.1 / sqrt(0.001) of the rate, its corrections for step 3 of 3
+    expected = 0.05 * (0.1 / (1 - 0.9**3)) / math.sqrt(0.001 / (1 - 0.999**3))
+    assert float(moved.median()) == pytest.approx(expected, rel=1e-3)
 
 
 def test_keep_takes_gradients_and_moments_along() -> None:
