@@ -26,8 +26,8 @@ SHRINK = 0.8 * CHILDREN
 class ScreenPull:
     """How hard the loss pulls at each Gaussian's place in the image: the mean over the views that drew it."""
 
-    def __init__(self, size: int) -> None:
-        self._sum, self._views = torch.zeros(size), torch.zeros(size)
+    def __init__(self, size: int, device: torch.device) -> None:
+        self._sum, self._views = torch.zeros(size, device=device), torch.zeros(size, device=device)
 
     def observe(self, slopes: Tensor, means: Tensor, camera: PinholeCamera, T_cam_world: Tensor) -> None:
         """Add a view.
@@ -80,9 +80,10 @@ def _chosen(g: Gaussians, chosen: Tensor) -> Gaussians:
 
 def _scattered(g: Gaussians, rng: np.random.Generator) -> Gaussians:
     """One smaller Gaussian in place of each."""
-    offsets = torch.from_numpy(rng.standard_normal((len(g), 3)).astype(np.float32)) * g.log_scales.exp()
+    device = g.means.device
+    offsets = torch.from_numpy(rng.standard_normal((len(g), 3)).astype(np.float32)).to(device) * g.log_scales.exp()
     if g.rotations is not None:
-        R = torch.from_numpy(se3.rotation_from_quaternion(g.rotations.double().numpy())).float()
+        R = torch.from_numpy(se3.rotation_from_quaternion(g.rotations.double().numpy(force=True))).float().to(device)
         offsets = (R @ offsets[:, :, None])[:, :, 0]
     return Gaussians(
         g.means + offsets, g.log_scales - math.log(SHRINK), g.logit_opacities, g.rgb, None, g.rotations

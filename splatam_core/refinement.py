@@ -91,7 +91,7 @@ class _Growth:
     """When a map grows."""
 
     def __init__(self, gaussian_map: GaussianMap, scene_radius: float, iterations: int, seed: int) -> None:
-        self.pull = ScreenPull(len(gaussian_map))
+        self.pull = ScreenPull(len(gaussian_map), gaussian_map.means.device)
         self._map, self._scene_radius, self._until = gaussian_map, scene_radius, GROW_UNTIL * iterations
         self._rng = np.random.default_rng(seed)
 
@@ -106,7 +106,7 @@ class _Growth:
             return
         if step >= GROW_FROM and step % GROW_EVERY == 0:
             grow(self._map, self.pull.mean(), self._scene_radius, self._rng)
-            self.pull = ScreenPull(len(self._map))
+            self.pull = ScreenPull(len(self._map), self._map.means.device)
         if step % RESET_EVERY == 0:
             self._map.set_opacities(RESET_OPACITY)
 
