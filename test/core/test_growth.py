@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from splatam_core import se3
+from splatam_core.backend import HOST
 from splatam_core.camera import PinholeCamera
 from splatam_core.gaussian_map import GaussianMap
 from splatam_core.growth import PULL, SHRINK, ScreenPull, grow
@@ -44,7 +45,7 @@ def test_pull_is_the_slope_of_the_loss_by_the_place_in_the_image() -> None:
 
     means = g.means.clone().requires_grad_()
     loss(means).backward()
-    pull = ScreenPull(5)
+    pull = ScreenPull(5, HOST)
     pull.observe(means.grad, g.means, CAMERA, T_CAM_WORLD)
     expected = torch.zeros(5, 2)
     z = (g.means @ T_CAM_WORLD[:3, :3].T + T_CAM_WORLD[:3, 3])[:, 2]
@@ -60,7 +61,7 @@ def test_pull_is_the_slope_of_the_loss_by_the_place_in_the_image() -> None:
 
 
 def test_pull_is_averaged_over_the_views_that_drew_it() -> None:
-    pull, means = ScreenPull(3), torch.tensor([[0.0, 0.0, 1.0]]).repeat(3, 1)
+    pull, means = ScreenPull(3, HOST), torch.tensor([[0.0, 0.0, 1.0]]).repeat(3, 1)
     slopes = torch.tensor([[3.0, 0, 0], [1.0, 0, 0], [0.0, 0, 0]])
     pull.observe(slopes, means, CAMERA, torch.eye(4))
     pull.observe(slopes * torch.tensor([[1.0], [0.0], [0.0]]), means, CAMERA, torch.eye(4))
