@@ -4,22 +4,36 @@
 
 Forward is everything from the parameters to the images, projection, sorting and binning included; backward is
 everything from the images' gradients to the parameters' (map) or to the pose's alone (pose).
+
+The roofline is the least time that the same work could take on the same cores. The work, counted and not measured: the
+arithmetic on every pixel of every tile that a Gaussian touches, and each array read and written once. The cores' best
+rates, measured: float32 operations of a matrix product, and bytes of a copy that does not fit the caches. Lists are not
+cut where a pixel is opaque, so what a pass leaves out there makes it look better than it is.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
+import math
 import statistics
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from header import print_header, timed_ms
 
 from splatam_core.camera import PinholeCamera
 from splatam_core.rasterizer import Gaussians, Rasterizer, Render, make_rasterizer
+from splatam_core.rasterizer.base import BLUR_PX2, MIN_ALPHA
 from splatam_core.rasterizer.cpu import CpuRasterizer
 
 SIZES = ((320, 240), (640, 480))
+TILE = 8
+# As the kernels are written (csrc/kernels.inl), a fused multiply-add counted as two.
+FORWARD_OPERATIONS = 17  # a pixel of a splat: alpha, its bounds, the weight, five sums, the transmittance
+BACKWARD_OPERATIONS = 45
+EXPONENTIAL_OPERATIONS = 22  # an argument and its exponential
+PROJECTION_OPERATIONS = 120  # a Gaussian to its splat, or back
 
 
 def camera(width: int, height: int) -> PinholeCamera:
@@ -64,8 +78,73 @@ def row(name: str, rasterizer: Rasterizer, cam: PinholeCamera, runs: int, anisot
           f'({min(both):.1f}-{max(both):.1f}) |', flush=True)  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True)
+class Work:
+    """Of one pass: float32 operations, bytes."""
+
+    operations: float
+    moved: float
+
+    def roofline_ms(self, rates: Work) -> float:
+        """The least time at given rates a second."""
+        return 1e3 * max(self.operations / rates.operations, self.moved / rates.moved)
+
+
+def touched_tiles(gaussians: Gaussians, cam: PinholeCamera) -> int:
+    """How many tiles the Gaussians touch in all, seen from the origin: a disc of alpha 1/255 against squares."""
+    z = gaussians.means[:, 2]
+    centre = torch.stack([cam.fx * gaussians.means[:, 0] / z + cam.cx, cam.fy * gaussians.means[:, 1] / z + cam.cy])
+    variance = (cam.fx * gaussians.log_scales[:, 0].exp() / z) ** 2 + BLUR_PX2
+    radius = (2 * variance * torch.log(torch.sigmoid(gaussians.logit_opacities) / MIN_ALPHA)).sqrt()
+    reach, total = math.ceil(radius.max().item() / TILE), 0
+    for x, y in itertools.product(range(-reach, reach + 1), repeat=2):
+        tile = torch.div(centre, TILE, rounding_mode='floor') + torch.tensor([[x], [y]])
+        nearest = torch.minimum(torch.maximum(centre, TILE * tile), TILE * tile + TILE - 1)
+        inside = (tile >= 0).all(0) & (TILE * tile[0] < cam.width) & (TILE * tile[1] < cam.height)
+        total += int((inside & (((nearest - centre) ** 2).sum(0) <= radius**2)).sum())
+    return total
+
+
+def work(gaussians: Gaussians, cam: PinholeCamera) -> tuple[Work, Work]:
+    """Of the forward and of the backward pass."""
+    entries, count, pixels = touched_tiles(gaussians, cam), len(gaussians), cam.width * cam.height
+    forward = Work(
+        entries * (TILE**2 * FORWARD_OPERATIONS + 2 * TILE * EXPONENTIAL_OPERATIONS) + count * PROJECTION_OPERATIONS,
+        4 * (count * (2 * 8 + 3) + 2 * entries + 5 * pixels),  # parameters, splats, tiles; lists; images
+    )
+    backward = Work(
+        entries * (TILE**2 * BACKWARD_OPERATIONS + 2 * TILE * EXPONENTIAL_OPERATIONS) + count * PROJECTION_OPERATIONS,
+        4 * (count * (8 + 8 + 8) + entries + 10 * pixels),  # splats, their gradients, the parameters'; lists; images
+    )
+    return forward, backward
+
+
+def best_rates(threads: int) -> Work:
+    """A second, on as many cores: of a matrix product, of a copy."""
+    torch.set_num_threads(threads)
+    matrix, long = torch.rand(1024, 1024), torch.rand(32_000_000)
+    product, copied = torch.empty_like(matrix), torch.empty_like(long)
+    operations = 2 * 1024**3 / (1e-3 * min(timed_ms(lambda: torch.mm(matrix, matrix, out=product), 10)))
+    moved = 2 * 4 * len(long) / (1e-3 * min(timed_ms(lambda: copied.copy_(long), 5)))
+    torch.set_num_threads(1)
+    return Work(operations, moved)
+
+
+def print_roofline() -> None:
+    """What the passes of the table above would take at best."""
+    print('\n| threads | Gflop/s | GB/s | image | forward: Mflop, MB | roofline ms | backward: Mflop, MB | roofline ms |')
+    print('|' + '---|' * 8)
+    for threads in (1, 2):
+        rates = best_rates(threads)
+        for size in SIZES:
+            cam = camera(*size)
+            cells = [f'{w.operations / 1e6:.0f}, {w.moved / 1e6:.0f} | {w.roofline_ms(rates):.1f}' for w in work(wavy_wall(cam), cam)]
+            best = f'{rates.operations / 1e9:.0f} | {rates.moved / 1e9:.1f}'
+            print(f'| {threads} | {best} | {cam.width}x{cam.height} | {cells[0]} | {cells[1]} |', flush=True)
+
+
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--runs', type=int, default=20)
     runs = parser.parse_args().runs
@@ -82,6 +161,7 @@ def main() -> None:
     small = camera(64, 48)
     for name in ('cpu', 'reference'):
         row(f'{name}, 1 thread', make_rasterizer(name, 1), small, runs)
+    print_roofline()
 
 
 if __name__ == '__main__':
