@@ -1,8 +1,12 @@
 // A few threads that wait for work: run(task) calls task(0..size-1) on all of them and returns when all are done.
+// A render is a dozen such tasks, each shorter than it takes to wake a thread: so a thread looks out for the next one for
+// a moment before it sleeps.
 #pragma once
 
 #include <atomic>
+#include <chrono>
 #include <condition_variable>
+#include <cstdint>
 #include <functional>
 #include <mutex>
 #include <thread>
@@ -37,7 +41,7 @@ class ThreadPool {
       std::lock_guard<std::mutex> lock(mutex_);
       task_ = &task;
       running_.store(size_ - 1, std::memory_order_relaxed);
-      ++generation_;
+      generation_.fetch_add(1, std::memory_order_release);
     }
     wake_.notify_all();
     task(0);
@@ -50,6 +54,7 @@ class ThreadPool {
     std::uint64_t seen = 0;
     for (;;) {
       const std::function<void(int)>* task;
+      look_out(seen);
       {
         std::unique_lock<std::mutex> lock(mutex_);
         wake_.wait(lock, [&] { return generation_ != seen; });
@@ -62,12 +67,19 @@ class ThreadPool {
     }
   }
 
+  // Until there is a task, or the moment is over.
+  void look_out(std::uint64_t seen) const {
+    const auto end = std::chrono::steady_clock::now() + std::chrono::microseconds(100);
+    while (generation_.load(std::memory_order_acquire) == seen && std::chrono::steady_clock::now() < end)
+      std::this_thread::yield();
+  }
+
   const int size_;
   std::vector<std::thread> threads_;
   std::mutex mutex_;
   std::condition_variable wake_;
   const std::function<void(int)>* task_ = nullptr;
-  std::uint64_t generation_ = 0;
+  std::atomic<std::uint64_t> generation_{0};
   std::atomic<int> running_{0};
   bool stopping_ = false;
 };

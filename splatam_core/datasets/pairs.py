@@ -91,10 +91,10 @@ class ImagePairs:
             width: of the frames in pixels; None keeps the recorded size.
 
         Raises:
-            DatasetError: stamps do not increase, or the first image is not of the camera's size.
+            DatasetError: stamps do not increase, or the first image that can be read is not of the camera's size.
         """
         base.check_increasing(np.array([pair.stamp_ns for pair in pairs], np.int64), name)
-        _check_size(pairs[0].color, (pairs[0].calibration or calibration).pinhole)
+        _check_size(pairs, calibration)
         self.name = name
         self.depth_scale = depth.scale
         self._pairs, self._calibration, self._depth, self._width = pairs, calibration, depth, width
@@ -120,14 +120,20 @@ class ImagePairs:
         return FrameFactory(calibration, self._width, self._depth.camera_of(calibration.pinhole), rectified)
 
 
-def _check_size(color: Path, stated: PinholeCamera) -> None:
+def _check_size(pairs: list[Pair], calibration: CameraCalibration) -> None:
     """Make sure that the camera is that of the images: otherwise every frame would be left out, one by one."""
-    width, height = files.image_size(color)
-    if (width, height) != (stated.width, stated.height):
-        raise DatasetError(
-            f'{color}: is {width}x{height}, but the camera is that of {stated.width}x{stated.height} images; state the '
-            'camera of these in a camera.yaml in the folder'
-        )
+    for pair in pairs:
+        try:
+            width, height = files.image_size(pair.color)
+        except DatasetError:
+            continue  # its own frame says so
+        stated = (pair.calibration or calibration).pinhole
+        if (width, height) != (stated.width, stated.height):
+            raise DatasetError(
+                f'{pair.color}: is {width}x{height}, but the camera is that of {stated.width}x{stated.height} images; state the '
+                'camera of these in a camera.yaml in the folder'
+            )
+        return
 
 
 def pair_up(

@@ -55,7 +55,9 @@ def test_stamps_start_at_one_second_and_count_at_30_hz(tmp_path):
 
 
 def test_default_intrinsics(tmp_path):
-    sequence = sevenscenes.read(write_scene(tmp_path, [0], K=None))
+    folder = write_scene(tmp_path, [0], K=None)
+    cv2.imwrite(str(folder / 'frame-000000.color.png'), np.zeros((480, 640, 3), np.uint8))
+    sequence = sevenscenes.read(folder)
     assert sequence.camera == DEFAULT_CAMERA.pinhole == PinholeCamera(640, 480, 585, 585, 320, 240)
 
 

@@ -11,7 +11,7 @@ import pytest
 from splatam_core.datasets import tum
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.datasets.tum import KNOWN_CAMERAS, associate
-from splatam_core.errors import CameraError, DatasetError, FrameError
+from splatam_core.errors import CameraError, DatasetError
 
 CAMERA_YAML = 'width: 64\nheight: 48\nfx: 50\nfy: 51\ncx: 31.5\ncy: 23.5\n'
 BASE = 1305031000
@@ -78,10 +78,11 @@ def test_nothing_pairs(tmp_path):
     [('rgbd_dataset_freiburg1_xyz', '1'), ('rgbd_dataset_freiburg2_desk', '2'), ('tum_fr3_office', '3')],
 )
 def test_known_camera_by_folder_name(tmp_path, name, number):
-    sequence = tum.read(write_tum(tmp_path / name, [1.0], [1.0], camera=None))
-    assert sequence.camera == KNOWN_CAMERAS[number].pinhole
-    with pytest.raises(FrameError, match='colour image is 64x48 but the camera is calibrated for 640x480'):
-        sequence[0]
+    folder = write_tum(tmp_path / name, [1.0], [1.0], camera=None)
+    with pytest.raises(DatasetError, match=r'rgb/0\.png: is 64x48, but the camera is that of 640x480 images'):
+        tum.read(folder)
+    cv2.imwrite(str(folder / 'rgb/0.png'), np.zeros((480, 640, 3), np.uint8))
+    assert tum.read(folder).camera == KNOWN_CAMERAS[number].pinhole
 
 
 def test_camera_yaml_wins_over_folder_name(tmp_path):

@@ -80,6 +80,9 @@ def test_lpips_that_cannot_be_used_says_why(
 
 def test_lpips_gets_images_as_its_network_takes_them() -> None:
     class Network:
+        def to(self, device: torch.device) -> Network:
+            return self
+
         def __call__(self, a: Tensor, b: Tensor, normalize: bool) -> Tensor:
             assert normalize and a.shape == b.shape == (1, 3, 40, 50)  # from [0, 1] to the [-1, 1] it was trained on
             return (a - b).abs().mean().reshape(1, 1, 1, 1)

@@ -121,7 +121,9 @@ def test_diagnostics_say_what_comes_and_goes(graph: Graph, frames: SyntheticSequ
         stamp_ns = graph.node.get_clock().now().nanoseconds - 500_000_000
         camera.send(replace(still(frames, next(sent)), stamp_ns=stamp_ns))
         graph.spin_for(0.2)
-        if not done or diagnostics.level('processing') != OK or float(values('processing', 'pose rate (Hz)')) < 2:
+        if not done or len(diagnostics.arrays) < 4 or diagnostics.level('processing') != OK:
+            return False
+        if float(values('processing', 'pose rate (Hz)')) < 2:
             return False
         # What came while the node was busy with the first frame has been taken: 5 Hz, give or take a busy machine.
         return all(1.5 < float(values('input', f'{topic} rate (Hz)')) < 10 for topic in topics)
@@ -135,7 +137,9 @@ def test_diagnostics_say_what_comes_and_goes(graph: Graph, frames: SyntheticSequ
         'splatam: input', 'splatam: tracking', 'splatam: processing', 'splatam: map'
     ]  # fmt: skip
     assert {status.hardware_id for status in array.status} == {CAMERA_FRAME}
-    assert 0.9 < np.median(np.diff([stamps.message_stamp_ns(array) for array in diagnostics.arrays])) / 1e9 < 1.5
+    # One a second; a single gap may be short or long where the one before it was late.
+    begin, *_, end = (stamps.message_stamp_ns(array) for array in diagnostics.arrays)
+    assert 0.7 < (end - begin) / 1e9 / (len(diagnostics.arrays) - 1) < 1.5
     assert abs(stamps.message_stamp_ns(array) - graph.node.get_clock().now().nanoseconds) < 10e9
     for topic in topics:
         assert 0.5 <= float(values('input', f'{topic} delay (s)')) < 30  # more than 0.5: a backlog, on a busy machine
