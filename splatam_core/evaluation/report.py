@@ -92,7 +92,7 @@ def subtitle(evaluation: Evaluation) -> str:
         source.path if source else 'live topics',
         f'preset {run.description.preset or "none"}',
         f'{run.camera.width}x{run.camera.height}' if run.camera else '',
-        f'{run.config.rasterizer} rasterizer',
+        f'{run.config.rasterizer} rasterizer' if run.config.rasterizer != 'auto' else '',
         run.description.program,
         f'commit {run.commit[:10]}{"-dirty" if run.commit.endswith("-dirty") else ""}' if run.commit else '',
     ]
