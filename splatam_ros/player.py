@@ -10,6 +10,7 @@ from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import ReliabilityPolicy
 from tqdm import tqdm
 
 from splatam_core.errors import SplatamError
@@ -28,6 +29,7 @@ STEP_S = 0.05  # longest time without a look at keys, signals and the graph
 LOOK_AROUND_S = 0.2
 LATE_SUBSCRIBERS_S = 5.0  # after the first image topic is heard; discovery takes up to 3 s
 QUIET_S = 3.0  # without an answer, before the player says what it waits for
+LINGER_S = 0.5  # at the end, for subscribers that acknowledge nothing: what they have not taken goes with us
 IN_FLIGHT = 8  # frames ahead of the transport's acknowledgements, where no topic answers
 
 
@@ -246,6 +248,8 @@ class Player:
             self._wait_for_answers(lambda: self._backlog.waiting == 0)
             for publisher in self._publishers.values():
                 self._wait_for_acknowledgement(publisher)
+            if any(_acknowledges_nothing(self._node, publisher) for publisher in self._publishers.values()):
+                time.sleep(LINGER_S)
 
     def _wait_for_acknowledgement(self, publisher: Publisher) -> None:
         timeout_s = self._options.acknowledge_timeout_s
@@ -340,3 +344,9 @@ def _is_awaited(topic: RecordedTopic) -> bool:
 def _is_acknowledged(publisher: Publisher) -> bool:
     """Whether every reliable subscriber has everything that was published."""
     return publisher.wait_for_all_acked(Duration(seconds=0))
+
+
+def _acknowledges_nothing(node: Node, publisher: Publisher) -> bool:
+    """Whether a subscriber has asked for best effort."""
+    subscribers = node.get_subscriptions_info_by_topic(publisher.topic_name)
+    return any(subscriber.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for subscriber in subscribers)
