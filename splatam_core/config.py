@@ -117,9 +117,10 @@ class TrackingConfig:
     )  # fmt: skip
     scale: float = _setting(1.0, 'Resolution at which frames are tracked, relative to the frame.', '', 0.05, 1.0)
     exposure: bool = _setting(True, "Of alignment: take up changes of the camera's exposure.")
-    half_render: bool = _setting(
-        False, 'Of alignment: render at half the resolution, the finest it works at; for Gaussians two pixels wide.'
-    )
+    half_render_from: int = _setting(
+        0, 'Of alignment: render at half the resolution, the finest it works at, where frames are as wide as this; 0 = never.',
+        'px', 0,
+    )  # fmt: skip
     lag: bool = _setting(True, 'Of alignment: take up that colour and depth of a frame were taken at different times.')
     rotation_rate: float = _setting(4e-4, 'Adam step of the unit quaternion.', '', 0.0)
     translation_rate: float = _setting(2e-3, 'Adam step of the translation.', 'm', 0.0)
@@ -162,6 +163,7 @@ class DensificationConfig:
         0.0, 'Add on other frames too, where a smaller share of the pixels with depth sees sure map.', '', 0.0, 1.0
     )
     scale: float = _setting(1.0, 'Resolution at which Gaussians are added, relative to the frame.', '', 0.05, 1.0)
+    max_width: int = _setting(0, 'The same in pixels, at most; 0 = any. Bounds how many are added, however large frames are.', 'px', 0)
     silhouette_threshold: float = _setting(0.5, 'Add where the silhouette is below this.', '', 0.0, 1.0)
     depth_error_ratio: float = _setting(
         50.0, 'Also add where the reading is in front of the map by more than this many median errors.', '', 0.0
@@ -211,6 +213,9 @@ class MappingConfig:
     )
     iterations: int = _setting(60, 'Optimisation steps per mapped frame.', '', 0)
     first_iterations: int = _setting(0, 'More steps on the first frame.', '', 0)
+    half_size_every: int = _setting(
+        0, 'Every n-th step of a frame fits the view at half size, for a quarter of the work; 0 = none.', 'steps', 0
+    )
     anisotropic: bool = _setting(
         False, 'Gaussians with three radii and a rotation instead of one radius; several times slower. Not with fused fitting.'
     )

@@ -39,8 +39,14 @@ def refine(
         more: steps on top of the configured ones.
     """
     fit = _fit_fused if config.mapping.optimizer == 'fused' else _fit_by_autograd
-    views = (draw(window, config.keyframes, rng) for _ in range(config.mapping.iterations + more))
+    steps = range(config.mapping.iterations + more)
+    views = (_sized(draw(window, config.keyframes, rng), step, config.mapping.half_size_every) for step in steps)
     fit(gaussian_map, views, rasterizer, config.mapping, scene_radius)
+
+
+def _sized(posed: PosedView, step: int, half_size_every: int) -> PosedView:
+    is_half = half_size_every and step % half_size_every == half_size_every - 1
+    return PosedView(posed.view.scaled(0.5), posed.T_cam_world) if is_half else posed
 
 
 def rates(config: MappingConfig) -> Rates:

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from splatam_core.camera import PinholeCamera
 from splatam_core.errors import RasterizerError
+from splatam_core.rasterizer.bounds import BLOCK, block_bounds
 from splatam_core.types import RenderedView
 
 NEAR_M = 0.2
@@ -31,7 +32,6 @@ BLUR_PX2 = 0.3
 MAX_ALPHA = 0.99
 MIN_ALPHA = 1.0 / 255.0
 MIN_TRANSMITTANCE = 1e-4
-BLOCK = 1024
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
 COLOR_LIMIT, DEPTH_LIMIT_M = 0.1, 0.02
 """Of ``fit``: up to here a residual counts by its square (over twice the limit), beyond by its size (Huber)."""
@@ -96,13 +96,17 @@ def check_isotropic(gaussians: Gaussians) -> None:
 
 
 def joined(first: Gaussians, second: Gaussians) -> Gaussians:
-    """Both, the first's before the second's; without bounds. Anisotropic where one of them is."""
+    """Both, the first's before the second's, with bounds where the first has them. Anisotropic where one of them is."""
     if first.rotations is not None or second.rotations is not None:
         first, second = first.anisotropic(), second.anisotropic()
     names = 'means', 'log_scales', 'logit_opacities', 'rgb', 'rotations'
-    return Gaussians(
-        **{name: torch.cat([getattr(first, name), getattr(second, name)]) for name in names if getattr(first, name) is not None}
-    )
+    values = {name: torch.cat([getattr(first, name), getattr(second, name)]) for name in names if getattr(first, name) is not None}
+    bounds = first.bounds
+    if bounds is not None and len(second):
+        full = len(first) // BLOCK
+        begin = full * BLOCK
+        bounds = torch.cat([bounds[:full], block_bounds(values['means'][begin:], values['log_scales'][begin:])])
+    return Gaussians(**values, bounds=bounds)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

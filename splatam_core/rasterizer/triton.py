@@ -18,7 +18,6 @@ from torch import Tensor
 from splatam_core.camera import PinholeCamera
 from splatam_core.errors import RasterizerError
 from splatam_core.rasterizer.base import BETA_1, BETA_2, Gaussians, Moments, Rates, Render, Target
-from splatam_core.rasterizer.base import BLOCK as BOUNDS_BLOCK
 
 try:
     import triton
@@ -28,6 +27,7 @@ except ImportError as error:
     ) from None
 
 from splatam_core.rasterizer import triton_kernels as kernels
+from splatam_core.rasterizer.bounds import BLOCK as BOUNDS_BLOCK
 from splatam_core.rasterizer.triton_lists import BLOCK, Capacity, Lister, View
 
 # Pixels on a tile's side, and splats that a program takes at once. On a GPU these keep to the registers, with two pixels a

@@ -76,7 +76,8 @@ class AlignmentTracker:
         self, gaussians: Gaussians, full: PinholeCamera, finest: PinholeCamera, T_cam_world: Matrix
     ) -> list[_Picture]:
         """The map from the first guess, at the resolutions of ``_levels``."""
-        camera = finest if self._config.half_render else full
+        least = self._config.half_render_from
+        camera = finest if 0 < least <= full.width else full
         with torch.no_grad():
             render = self._rasterizer.render(gaussians, camera, pose_tensor(T_cam_world, gaussians.means.device))
         picture = _reference(camera, render, self._config.silhouette_threshold)

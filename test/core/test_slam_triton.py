@@ -53,7 +53,7 @@ def test_alignment_to_an_interpreted_render_finds_the_same_pose(room: Room) -> N
         slam.process(sequence[index])
     view, truth = View.from_frame(sequence[2], slam.config.depth), sequence.ground_truth().T_world_cam
     guess = se3.inverse(truth[1]) @ truth[0]
-    config = TrackingConfig(method='align', iterations=6, half_render=True)
+    config = TrackingConfig(method='align', iterations=6, half_render_from=64)
     results = []
     for name in ('cpu', 'triton'):
         rasterizer, device = rasterizer_for(load_config('quick', ['threads=1', f'rasterizer={name}']))

@@ -90,16 +90,16 @@ def test_nothing_in_sight_gives_an_empty_system() -> None:
         assert np.isnan(medians).all()
 
 
-@pytest.mark.parametrize(('lag', 'half_render'), [(True, False), (False, True)])
+@pytest.mark.parametrize(('lag', 'half_render_from'), [(True, 0), (False, 160)])
 def test_tracker_finds_the_same_pose_by_either(
-    lag: bool, half_render: bool, room: Callable[..., SyntheticSequence], monkeypatch: pytest.MonkeyPatch
+    lag: bool, half_render_from: int, room: Callable[..., SyntheticSequence], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To 0.2 mm, a fiftieth of a pixel here: Gauss-Newton amplifies the rounding of points on the border a little."""
     sequence = room(3, 160)
     slam = Slam(load_config('quick', ['threads=1', 'device=cpu']))
     for index in range(2):
         slam.process(sequence[index])
-    config = TrackingConfig(method='align', iterations=6, lag=lag, half_render=half_render)
+    config = TrackingConfig(method='align', iterations=6, lag=lag, half_render_from=half_render_from)
     view = View.from_frame(sequence[2], slam.config.depth)
     truth = sequence.ground_truth().T_world_cam
     before, guess = (se3.inverse(truth[index]) @ truth[0] for index in (0, 1))
