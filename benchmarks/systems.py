@@ -37,7 +37,7 @@ from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame, StageTimings, Trajectory
 
 Poses = list[NDArray[np.float64] | None]
-SCORED_EVERY = 5
+SCORED_EVERY = 7  # no multiple of the keyframes' distance: those the map knows better
 
 
 @dataclass(frozen=True, slots=True)

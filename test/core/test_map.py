@@ -15,7 +15,8 @@ from splatam_core.densification import densify, new_gaussians, unexplained
 from splatam_core.gaussian_map import PARAMETERS, GaussianMap
 from splatam_core.keyframes import PosedView, draw, is_due, overlaps, select_window
 from splatam_core.mapping import prunable, refine
-from splatam_core.rasterizer import Gaussians, Rates, Render, make_rasterizer
+from splatam_core.rasterizer import Gaussians, Moments, Rates, Render, Target, joined, make_rasterizer
+from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.view import View
 
 CAMERA = PinholeCamera(32, 24, 30.0, 30.0, 15.5, 11.5)
@@ -106,6 +107,12 @@ def test_densification_at_half_resolution_adds_a_quarter_of_wider_gaussians() ->
     torch.testing.assert_close(added.log_scales.exp(), torch.full((192, 1), 2.0 / 15.0))
 
 
+@pytest.mark.parametrize(('max_width', 'width'), [(0, 32), (64, 32), (16, 16), (8, 8)])
+def test_the_width_of_the_image_bounds_how_many_are_added(max_width: int, width: int) -> None:
+    rasterizer, config = make_rasterizer('cpu', 1), DensificationConfig(max_width=max_width)
+    assert len(densify(GaussianMap().gaussians, _view(), EYE, rasterizer, config)) == width * width * 3 // 4
+
+
 def test_settled_gaussians_render_at_the_depth_they_were_read_at() -> None:
     """On a floor seen at a grazing angle, blending front to back favours the nearer neighbours; settling undoes that."""
     v = torch.arange(24.0)[:, None].expand(24, 32)
@@ -137,6 +144,19 @@ def test_mapping_makes_the_render_look_like_the_view(optimizer: str) -> None:
     refine(gaussian_map, window, rasterizer, config, 1.0, np.random.default_rng(0))
     after = error(rasterizer.render(gaussian_map.gaussians, CAMERA, EYE))
     assert after < 0.5 * before
+
+
+def test_every_other_step_fits_at_half_size() -> None:
+    widths = []
+
+    class Watched(CpuRasterizer):
+        def fit(self, gaussians: Gaussians, moments: Moments, rates: Rates, target: Target) -> float:
+            widths.append((target.camera.width, *target.rgb8.shape[:2], *target.depth.shape))
+            return super().fit(gaussians, moments, rates, target)
+
+    config = load_config(overrides={'mapping.iterations': 5, 'mapping.optimizer': 'fused', 'mapping.half_size_every': 2})
+    refine(_map(_view()), [PosedView(_view(), EYE)], Watched(1), config, 1.0, np.random.default_rng(0))
+    assert widths == [full := (32, 24, 32, 24, 32), half := (16, 12, 16, 12, 16), full, half, full]
 
 
 @pytest.mark.parametrize('optimizer', ['autograd', 'fused'])
@@ -252,18 +272,21 @@ def test_the_current_view_gets_its_share_of_the_steps() -> None:
         assert np.mean(drawn) == pytest.approx(expected, abs=0.04)  # four standard deviations of 2000 draws
 
 
+def _cluster(n: int, generator: torch.Generator) -> Gaussians:
+    where = 6 * torch.rand(3, generator=generator) - 3
+    means = where + 0.5 * torch.randn(n, 3, generator=generator)
+    log_scales = -4 + 2 * torch.rand(n, 1, generator=generator)
+    rgb = torch.rand(n, 3, generator=generator)
+    return Gaussians(means, log_scales, torch.randn(n, generator=generator), rgb)
+
+
 def test_gaussians_out_of_view_are_skipped_without_a_trace() -> None:
     """Bounds change nothing but time: with and without them the images are the same, bit for bit."""
     generator = torch.Generator().manual_seed(0)
     rasterizer = make_rasterizer('cpu', 2)
     gaussian_map = GaussianMap()
     for _ in range(20):
-        where = 6 * torch.rand(3, generator=generator) - 3
-        n = int(torch.randint(1, 1500, (1,), generator=generator))
-        means = where + 0.5 * torch.randn(n, 3, generator=generator)
-        log_scales = -4 + 2 * torch.rand(n, 1, generator=generator)
-        rgb = torch.rand(n, 3, generator=generator)
-        gaussian_map.append(Gaussians(means, log_scales, torch.randn(n, generator=generator), rgb))
+        gaussian_map.append(_cluster(int(torch.randint(1, 1500, (1,), generator=generator)), generator))
     gaussian_map.keep(torch.rand(len(gaussian_map), generator=generator) > 0.1)
     bounded = gaussian_map.gaussians
     assert bounded.bounds is not None and len(bounded.bounds) == -(-len(gaussian_map) // 1024)
@@ -272,6 +295,17 @@ def test_gaussians_out_of_view_are_skipped_without_a_trace() -> None:
         pose = _at(0.5 * k - 3, 0.5 * k)
         first, second = (rasterizer.render(gaussians, CAMERA, pose) for gaussians in (bounded, unbounded))
         assert torch.equal(first.rgb, second.rgb) and torch.equal(first.silhouette, second.silhouette)
+
+
+@pytest.mark.parametrize(('old', 'new'), [(0, 5), (1024, 0), (1024, 3000), (1500, 10), (2500, 3000)])
+def test_joined_gaussians_are_bounded_as_one_map_of_them(old: int, new: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    gaussian_map, more = GaussianMap(), _cluster(new, generator)
+    gaussian_map.append(_cluster(old, generator))
+    together = joined(gaussian_map.gaussians, more)
+    gaussian_map.append(more)
+    assert torch.equal(together.bounds, gaussian_map.gaussians.bounds)
+    assert len(joined(more, more)) == 2 * new and joined(more, more).bounds is None
 
 
 def test_bounds_follow_what_fitting_moves() -> None:
