@@ -147,16 +147,16 @@ def test_mapping_makes_the_render_look_like_the_view(optimizer: str) -> None:
 
 
 def test_every_other_step_fits_at_half_size() -> None:
-    widths = []
+    sizes = []
 
     class Watched(CpuRasterizer):
         def fit(self, gaussians: Gaussians, moments: Moments, rates: Rates, target: Target) -> float:
-            widths.append((target.camera.width, *target.rgb8.shape[:2], *target.depth.shape))
+            sizes.append((target.camera.width, *target.rgb8.shape[:2], *target.depth.shape))
             return super().fit(gaussians, moments, rates, target)
 
     config = load_config(overrides={'mapping.iterations': 5, 'mapping.optimizer': 'fused', 'mapping.half_size_every': 2})
     refine(_map(_view()), [PosedView(_view(), EYE)], Watched(1), config, 1.0, np.random.default_rng(0))
-    assert widths == [full := (32, 24, 32, 24, 32), half := (16, 12, 16, 12, 16), full, half, full]
+    assert sizes == [full := (32, 24, 32, 24, 32), half := (16, 12, 16, 12, 16), full, half, full]
 
 
 @pytest.mark.parametrize('optimizer', ['autograd', 'fused'])
