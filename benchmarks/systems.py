@@ -61,6 +61,7 @@ def run_ours(frames: Sequence[RgbdFrame], preset: str, overrides: list[str]) -> 
     slam = Slam(config)
     begin = time.perf_counter()
     results = [slam.process(frame) for frame in frames]
+    slam.finish()
     return [result.T_world_cam for result in results], time.perf_counter() - begin, slam, [r.timings for r in results]
 
 

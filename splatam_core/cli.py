@@ -102,7 +102,10 @@ def run(args: argparse.Namespace) -> int:
             failure = _process(job, stop)
             if failure is not None or stop.requested:
                 job.checkpoints.at_stop(job.slam)
-            metrics = job.folder.finish(job.slam)
+                finish_s = 0.0
+            else:
+                finish_s = _finish(job)
+            metrics = job.folder.finish(job.slam, finish_s)
     except OSError as error:
         raise RunFolderError(f'{path}: cannot be written: {error.strerror}; make room{_resume_hint(path)}') from None
     if failure is not None:
@@ -215,6 +218,15 @@ class _StopRequest:
         self.requested = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
         say('stopping after this frame; Ctrl-C again stops at once, without saving the map')
+
+
+def _finish(job: _Job) -> float:
+    """Fit the map once more, where the settings ask for it; the seconds that took."""
+    if job.slam.config.mapping.final_passes:
+        say('all frames are processed; fitting the map to all keyframes once more')
+    begin = time.perf_counter()
+    job.slam.finish()
+    return time.perf_counter() - begin
 
 
 def _process(job: _Job, stop: _StopRequest) -> DatasetError | None:

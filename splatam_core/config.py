@@ -216,6 +216,10 @@ class MappingConfig:
     half_size_every: int = _setting(
         0, 'Every n-th step of a frame fits the view at half size, for a quarter of the work; 0 = none.', 'steps', 0
     )
+    final_passes: int = _setting(
+        0, 'After the last frame, how often each keyframe is fitted once more, step sizes fading. Of fused fitting.', '', 0
+    )
+    final_width: int = _setting(0, 'Wider keyframes are halved for that until they are not; 0 = none is.', 'px', 0)
     anisotropic: bool = _setting(
         False, 'Gaussians with three radii and a rotation instead of one radius; several times slower. Not with fused fitting.'
     )
@@ -363,6 +367,11 @@ def with_values(config: SlamConfig, values: Mapping[str, object]) -> SlamConfig:
         )
     if config.mapping.optimizer == 'fused':
         _check_fused(config.mapping)
+    elif config.mapping.final_passes:
+        raise ConfigError(
+            f'mapping.final_passes = {config.mapping.final_passes}: is of fused fitting only; set it to 0, or '
+            "mapping.optimizer=fused; 'splatam refine' fits a finished map by autograd"
+        )
     return config
 
 

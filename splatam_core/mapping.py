@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -16,6 +17,9 @@ from splatam_core.rasterizer import Rasterizer, Rates, Target
 
 RESET_OPACITY = 0.01
 """What the original makes of all opacities (``reset_opacities``), as 3D Gaussian splatting does."""
+
+FINAL_FIRST, FINAL_LAST, FINAL_MEANS, FINAL_SCALES = 5.0, 0.2, 0.3, 3.0
+"""Of ``refit``: step sizes at its beginning and end, relative to the usual ones, and factors of centres and log scales."""
 
 
 def refine(
@@ -83,15 +87,68 @@ def _fit_fused(
     scene_radius: float,
 ) -> None:  # fmt: skip
     for posed in views:
-        view = posed.view
-        target = Target(
-            view.camera, view.rgb8, view.depth, posed.T_cam_world, config.color_weight, config.depth_weight
-        )
-        rasterizer.fit(gaussian_map.gaussians, gaussian_map.moments, rates(config), target)
+        _step_fused(gaussian_map, posed, rasterizer, config, rates(config))
     if config.prune_every:
         chosen = prunable(gaussian_map, config.prune_opacity, config.prune_scale * scene_radius)
         if chosen.sum() > config.prune_share * len(gaussian_map):
             gaussian_map.keep(~chosen)
+
+
+def _step_fused(
+    gaussian_map: GaussianMap, posed: PosedView, rasterizer: Rasterizer, config: MappingConfig, rates: Rates
+) -> None:
+    view = posed.view
+    target = Target(view.camera, view.rgb8, view.depth, posed.T_cam_world, config.color_weight, config.depth_weight)
+    rasterizer.fit(gaussian_map.gaussians, gaussian_map.moments, rates, target)
+
+
+def refit(
+    gaussian_map: GaussianMap,
+    keyframes: Sequence[PosedView],
+    rasterizer: Rasterizer,
+    config: MappingConfig,
+    rng: np.random.Generator,
+    limit_s: float = math.inf,
+) -> int:
+    """Fit the map to all keyframes in turn, poses fixed, step sizes fading: what few steps a frame forgot comes back.
+
+    Args:
+        gaussian_map: changed in place.
+        keyframes: the views to fit.
+        rasterizer: draws the map; its fused fitting is used.
+        config: passes, weights, rates.
+        rng: draws the order of each pass.
+        limit_s: seconds after which the step sizes have faded, however many steps that were.
+
+    Returns:
+        How many steps it took.
+    """
+    num_steps, began_s = config.final_passes * len(keyframes), time.monotonic()
+    for step in range(num_steps):
+        if step % len(keyframes) == 0:
+            order = rng.permutation(len(keyframes))
+        done = max(step / num_steps, (time.monotonic() - began_s) / limit_s)
+        if done >= 1:
+            return step
+        posed = _narrowed(keyframes[order[step % len(keyframes)]], config.final_width)
+        _step_fused(gaussian_map, posed, rasterizer, config, _final_rates(config, done))
+    return num_steps
+
+
+def _final_rates(config: MappingConfig, done: float) -> Rates:
+    fade = FINAL_FIRST * (FINAL_LAST / FINAL_FIRST) ** done
+    usual = rates(config)
+    return Rates(
+        FINAL_MEANS * fade * usual.means, FINAL_SCALES * fade * usual.log_scales, fade * usual.logit_opacities,
+        fade * usual.rgb, fade * usual.rotations,
+    )  # fmt: skip
+
+
+def _narrowed(posed: PosedView, max_width: int) -> PosedView:
+    view = posed.view
+    while max_width and view.camera.width > max_width:
+        view = view.scaled(0.5)
+    return PosedView(view, posed.T_cam_world)
 
 
 def prunable(gaussian_map: GaussianMap, min_opacity: float, max_scale_m: float) -> Tensor:

@@ -278,18 +278,23 @@ class RunFolder:
         information['resumed'] = [*information.get('resumed', []), resumption]
         replace_text(self.path / RUN, _to_json(information))
 
-    def save(self, slam: Slam) -> Metrics:
-        """Write ``map.ply``, ``metrics.json`` and the settings as of now; may be called again later."""
+    def save(self, slam: Slam, finish_s: float = 0.0) -> Metrics:
+        """Write ``map.ply``, ``metrics.json`` and the settings as of now; may be called again later.
+
+        Args:
+            slam: whose map.
+            finish_s: wall time in ``Slam.finish``.
+        """
         replace_text(self.path / CONFIG, to_yaml(slam.config))
         gaussians = slam.map.gaussians
         write_ply(self.path / MAP, gaussians)
-        metrics = run_metrics(self._records, len(gaussians), environment.peak_rss_mb())
+        metrics = run_metrics(self._records, len(gaussians), environment.peak_rss_mb(), finish_s)
         replace_text(self.path / METRICS, metrics.to_json())
         return metrics
 
-    def finish(self, slam: Slam) -> Metrics:
+    def finish(self, slam: Slam, finish_s: float = 0.0) -> Metrics:
         """Save, and close the files."""
-        metrics = self.save(slam)
+        metrics = self.save(slam, finish_s)
         self.close()
         return metrics
 
@@ -317,10 +322,12 @@ class RunFolder:
         replace_text(self.path / RUN, _to_json(information | {'camera': asdict(camera)}))
 
 
-def run_metrics(records: Sequence[FrameRecord], num_gaussians: int | None, peak_rss_mb: float | None) -> Metrics:
+def run_metrics(
+    records: Sequence[FrameRecord], num_gaussians: int | None, peak_rss_mb: float | None, finish_s: float = 0.0
+) -> Metrics:
     """What a run's frames say about it without any truth."""
     lost = sum(record.status is Status.LOST for record in records)
-    process_ms = sum(record.process_ms for record in records)
+    process_ms = sum(record.process_ms for record in records) + 1e3 * finish_s
     decode_ms = [record.decode_ms for record in records if record.decode_ms is not None]
     with_io_ms = process_ms + sum(decode_ms) if len(decode_ms) == len(records) else 0.0
     return Metrics(
@@ -332,6 +339,7 @@ def run_metrics(records: Sequence[FrameRecord], num_gaussians: int | None, peak_
         num_gaussians=num_gaussians,
         peak_rss_mb=peak_rss_mb,
         timings_ms=stage_statistics([record.timings for record in records]),
+        finish_s=round(finish_s, 3),
         peak_gpu_mb=environment.peak_gpu_mb(),
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field, replace
 
@@ -18,7 +19,7 @@ from splatam_core.densification import densify
 from splatam_core.errors import ConfigError, FrameError, SplatamError
 from splatam_core.gaussian_map import GaussianMap
 from splatam_core.keyframes import KeyframeStore, PosedView, is_due, select_window
-from splatam_core.mapping import refine
+from splatam_core.mapping import refine, refit
 from splatam_core.motion import MotionModel, MotionPrior
 from splatam_core.rasterizer import Gaussians, make_rasterizer
 from splatam_core.tracking import make_tracker
@@ -173,6 +174,20 @@ class Slam:
         T_cam_world = pose_tensor(se3.inverse(T_world_cam), self.backend.device)
         with torch.no_grad():
             return self._rasterizer.render(self.map.gaussians.detached(), self.camera, T_cam_world).images()
+
+    def finish(self, limit_s: float = math.inf) -> int:
+        """Fit the map to all keyframes once more, after the last frame (``mapping.final_passes``; 0 leaves all as it is).
+
+        Args:
+            limit_s: seconds it may take.
+
+        Returns:
+            How many steps it took.
+        """
+        if not self.config.mapping.enabled:
+            return 0
+        keyframes = self._keyframes.window(self._keyframes)
+        return refit(self.map, keyframes, self._rasterizer, self.config.mapping, self._rng, limit_s)
 
     def snapshot(self) -> MapSnapshot:
         """A copy of the map."""

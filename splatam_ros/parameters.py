@@ -36,6 +36,9 @@ NODE_SETTINGS: tuple[Setting, ...] = (
     _setting('save_root', '', 'save_path may change at run time to a folder below this; none = not at all.'),
     _setting('overwrite', False, 'Replace the run that is in save_path, if nothing else is there.'),
     _setting('save_on_shutdown', True, 'Save map and metrics at the end; the trajectory is written as it goes anyway.'),
+    _setting(
+        'finish_limit', 3.0, 'Longest time for mapping.final_passes before that; launch kills 10 s after its Ctrl-C.', 's', 0.1
+    ),
     _setting('load_path', '', 'Map for ~/load_map, a .ply file or the folder of a run; loaded at the start, too.'),
     _setting('load_pose', '', 'Where the camera is in a loaded map, x y z qx qy qz qw; none = where it began.', 'm'),
     _setting('width', 0, 'Resize frames to this width; 0 = as they come.', 'px', 0, 16384),
@@ -98,6 +101,7 @@ class NodeOptions:
     save_root: str
     overwrite: bool
     save_on_shutdown: bool
+    finish_limit: float
     load_path: str
     load_pose: str
     width: int
@@ -148,8 +152,8 @@ def field_name(name: str) -> str:
 
 # Everything else is read when the node starts.
 CHANGEABLE = frozenset({
-    'save_path', 'save_on_shutdown', 'load_path', 'load_pose', 'on_time_jump', 'on_camera_change', 'lost_reset_after',
-    'max_rate_hz', 'max_cloud_points', 'publish_rate.path', 'publish_rate.render', 'publish_rate.cloud',
+    'save_path', 'save_on_shutdown', 'finish_limit', 'load_path', 'load_pose', 'on_time_jump', 'on_camera_change',
+    'lost_reset_after', 'max_rate_hz', 'max_cloud_points', 'publish_rate.path', 'publish_rate.render', 'publish_rate.cloud',
     'no_data_timeout', 'exit_on_publisher_end',
 })  # fmt: skip
 FIXED = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -106,8 +107,12 @@ class Session:
         self._logger.warning(f'map reset: {why}{kept}')
         return f'the next frame starts a new map{kept}'
 
-    def save(self, slam: Slam) -> Metrics:
+    def save(self, slam: Slam, finish_s: float = 0.0) -> Metrics:
         """Save map, trajectory and metrics in ``save_path``.
+
+        Args:
+            slam: whose map.
+            finish_s: wall time in ``Slam.finish``.
 
         Raises:
             SplatamError: ``save_path`` is empty, no folder can be made of it, or it cannot be written.
@@ -120,7 +125,7 @@ class Session:
         elif self._folder.path != path:
             self._folder = self._folder.moved(path)
         try:
-            metrics = self._folder.save(slam)
+            metrics = self._folder.save(slam, finish_s)
         except OSError as error:
             why = f'cannot be saved: {error.strerror}; each file there is whole, of now or of the last time'
             raise RunFolderError(f'{path}: {why}; save again when that is mended') from None
@@ -129,14 +134,19 @@ class Session:
         return metrics
 
     def finish(self, slam: Slam) -> None:
-        """Save at the end; where no frame ever came leave the folder empty, for the next attempt.
+        """Fit the map once more, and save it; where no frame ever came leave the folder empty, for the next attempt.
 
         Raises:
             SplatamError: as ``save``.
         """
         folder = self._folder
         if folder is None or not folder.is_empty or folder.has_previous:
-            self.save(slam)
+            begin = time.monotonic()
+            steps = slam.finish(self.options.finish_limit)
+            finish_s = time.monotonic() - begin
+            if steps:
+                self._logger.info(f'fitted the map to all keyframes once more: {steps} steps in {finish_s:.1f} s')
+            self.save(slam, finish_s)
             return
         folder.discard()
         self._logger.info(f'no frame came, so nothing is saved in {folder.path}')

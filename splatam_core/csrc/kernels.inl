@@ -339,7 +339,7 @@ static double fit(const TileList& tile, const Splat* splats, const Camera& camer
   return loss;
 }
 
-constexpr float kBeta1 = 0.9f, kBeta2 = 0.999f, kEpsilon = 1e-15f;
+constexpr float kBeta1 = 0.9f, kBeta2 = 0.99f, kEpsilon = 1e-15f;
 
 static void update(const Splat* splats, const std::uint32_t* ids, const SplatGradient* gradients, std::size_t begin,
                    std::size_t end, const Camera& camera, const Pose& pose, const MutableGaussians& gaussians,

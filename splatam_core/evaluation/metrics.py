@@ -37,6 +37,7 @@ class Metrics:
         num_gaussians: size of the final map; None where it was not saved.
         peak_rss_mb: most memory the process held, MiB.
         timings_ms: wall time of each stage over the frames.
+        finish_s: wall time of fitting the map once more after the last frame; the two rates count it.
         peak_gpu_mb: most memory its tensors took on a GPU, MiB; None where there were none.
         ate_rmse_m: root mean squared distance of the camera centres to the truth, all tracked frames, SE(3)-aligned.
         ate_frames: tracked frames that have a truth and thus enter ``ate_rmse_m``.
@@ -76,6 +77,7 @@ class Metrics:
     num_gaussians: int | None
     peak_rss_mb: float | None
     timings_ms: Mapping[str, StageStatistics]
+    finish_s: float = 0.0
     peak_gpu_mb: float | None = None
     ate_rmse_m: float | None = None
     ate_frames: int | None = None

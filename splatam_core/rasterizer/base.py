@@ -33,6 +33,9 @@ MAX_ALPHA = 0.99
 MIN_ALPHA = 1.0 / 255.0
 MIN_TRANSMITTANCE = 1e-4
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
+FIT_BETA_2 = 0.99
+"""Of ``fit``, whose moments live long: a mean over fewer steps follows what the view shows (docs/decisions/0004)."""
+
 COLOR_LIMIT, DEPTH_LIMIT_M = 0.1, 0.02
 """Of ``fit``: up to here a residual counts by its square (over twice the limit), beyond by its size (Huber)."""
 

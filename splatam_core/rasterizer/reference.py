@@ -8,11 +8,11 @@ from torch import Tensor
 from splatam_core.camera import PinholeCamera
 from splatam_core.rasterizer.base import (
     BETA_1,
-    BETA_2,
     BLUR_PX2,
     COLOR_LIMIT,
     DEPTH_LIMIT_M,
     EPSILON,
+    FIT_BETA_2,
     MAX_ALPHA,
     MIN_ALPHA,
     MIN_TRANSMITTANCE,
@@ -60,10 +60,10 @@ class ReferenceRasterizer:
         moments.steps[seen] += (moments.steps[seen] < 255).to(torch.uint8)
         step = moments.steps[seen, None].to(gradient.dtype)
         first, second = moments.first_second[seen].to(gradient.dtype).split(8, dim=1)
-        first, second = BETA_1 * first + (1 - BETA_1) * gradient, BETA_2 * second + (1 - BETA_2) * gradient**2
+        first, second = BETA_1 * first + (1 - BETA_1) * gradient, FIT_BETA_2 * second + (1 - FIT_BETA_2) * gradient**2
         moments.first_second[seen] = torch.cat([first, second], dim=1).to(moments.first_second.dtype)
         rate = torch.tensor([rates.means] * 3 + [rates.log_scales, rates.logit_opacities] + [rates.rgb] * 3).to(step.device)
-        move = rate * (first / (1 - BETA_1**step)) / ((second / (1 - BETA_2**step)).sqrt() + EPSILON)
+        move = rate * (first / (1 - BETA_1**step)) / ((second / (1 - FIT_BETA_2**step)).sqrt() + EPSILON)
         for value, moved in zip(values, move.split([3, 1, 1, 3], dim=1), strict=True):
             value[seen] -= moved.to(value.dtype)
         return loss.item()

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from splatam_core.camera import PinholeCamera
 from splatam_core.errors import RasterizerError
-from splatam_core.rasterizer.base import BETA_1, BETA_2, Gaussians, Moments, Rates, Render, Target
+from splatam_core.rasterizer.base import BETA_1, FIT_BETA_2, Gaussians, Moments, Rates, Render, Target
 
 try:
     import triton
@@ -199,7 +199,7 @@ def _fit_tiles(view: View, target: Target, gradients: Tensor) -> Tensor:
 def _corrections() -> Tensor:
     """[256, 2] what Adam's moments are divided by after so many steps."""
     steps = torch.arange(_MAX_STEPS + 1, dtype=torch.float64)
-    return torch.stack([1 - BETA_1**steps, 1 - BETA_2**steps], dim=1).float()
+    return torch.stack([1 - BETA_1**steps, 1 - FIT_BETA_2**steps], dim=1).float()
 
 
 def _check(gaussians: Gaussians, T_cam_world: Tensor) -> None:

@@ -27,7 +27,7 @@ MAX_ALPHA = tl.constexpr(base.MAX_ALPHA)
 MIN_ALPHA = tl.constexpr(base.MIN_ALPHA)
 MIN_TRANSMITTANCE = tl.constexpr(base.MIN_TRANSMITTANCE)
 COLOR_LIMIT, DEPTH_LIMIT_M = tl.constexpr(base.COLOR_LIMIT), tl.constexpr(base.DEPTH_LIMIT_M)
-BETA_1, BETA_2, EPSILON = tl.constexpr(base.BETA_1), tl.constexpr(base.BETA_2), tl.constexpr(base.EPSILON)
+BETA_1, BETA_2, EPSILON = tl.constexpr(base.BETA_1), tl.constexpr(base.FIT_BETA_2), tl.constexpr(base.EPSILON)
 FIELDS = tl.constexpr(8)  # of a splat (u, v, falloff, opacity, r, g, b, z) and of its gradient, as in csrc/kernels.hpp
 
 
