@@ -121,6 +121,10 @@ class TrackingConfig:
         0, 'Of alignment: render at half the resolution, the finest it works at, where frames are as wide as this; 0 = never.',
         'px', 0,
     )  # fmt: skip
+    again_below: float = _setting(
+        0.0, 'Of alignment: where a smaller share of the pixels agrees, render and align once more from there; 0 = never.',
+        '', 0.0, 1.0,
+    )  # fmt: skip
     lag: bool = _setting(True, 'Of alignment: take up that colour and depth of a frame were taken at different times.')
     rotation_rate: float = _setting(4e-4, 'Adam step of the unit quaternion.', '', 0.0)
     translation_rate: float = _setting(2e-3, 'Adam step of the translation.', 'm', 0.0)

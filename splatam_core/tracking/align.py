@@ -62,7 +62,18 @@ class AlignmentTracker:
     ) -> TrackingResult:
         """See ``Tracker.track``."""
         frames = self._levels(_frame(view))
-        references = self._references(gaussians, view.camera, frames[0].camera, T_cam_world)
+        found = self._track(frames, view.camera, gaussians, T_cam_world, T_cam_world_before)
+        if found.inlier_fraction >= self._config.again_below:
+            return found
+        again = self._track(frames, view.camera, gaussians, found.T_cam_world_depth, T_cam_world_before)
+        return max(found, again, key=lambda result: result.inlier_fraction)
+
+    def _track(
+        self, frames: list[_Picture], camera: PinholeCamera, gaussians: Gaussians, T_cam_world: Matrix,
+        T_cam_world_before: Matrix | None,
+    ) -> TrackingResult:  # fmt: skip
+        """Render from the first guess, and align to that."""
+        references = self._references(gaussians, camera, frames[0].camera, T_cam_world)
         before = None if T_cam_world_before is None else T_cam_world @ se3.inverse(T_cam_world_before)
         alignment = self._align(references, frames, before)
         fit = alignment.fit

@@ -40,7 +40,7 @@ SOURCE = ['synthetic:noise=off', '--width', str(WIDTH), '--max-frames', str(FRAM
 PRESETS = ('quick', 'splatam', 'realtime')
 FAST = ['threads=1', 'mapping.iterations=6', 'keyframes.every=2', 'keyframes.window=3']
 ITERATIONS = {'quick': 6, 'splatam': 8, 'realtime': 6}
-MEASURED = {'fps', 'fps_with_io', 'timings_ms', 'peak_rss_mb', 'peak_gpu_mb'}  # times, and the memory of one process
+MEASURED = {'fps', 'fps_with_io', 'timings_ms', 'finish_s', 'peak_rss_mb', 'peak_gpu_mb'}  # times, and the memory of one process
 PROGRESS = Progress(FRAMES, 3, '0' * 64, 4)
 
 

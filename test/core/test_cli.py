@@ -24,6 +24,7 @@ from splatam_core.ply import read_ply
 from splatam_core.run_folder import RunDescription, RunFolder, Source, read_run
 from splatam_core.slam import Slam
 from splatam_core.trajectory import pose_line, stamp_text
+from splatam_core.types import FrameResult, RgbdFrame
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = 'synthetic'
@@ -295,6 +296,27 @@ def test_kill_keeps_the_trajectory(long_run: tuple[subprocess.Popen[str], Path])
     m = metrics(folder)
     assert m['frames'] >= 3 and m['ate_rmse_m'] is not None
     assert m['psnr_db'] is None and m['num_gaussians'] is None
+
+
+def test_the_steps_after_the_last_frame_are_counted_and_are_not_of_a_run_that_was_stopped(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = ['--preset', 'realtime', '--width', WIDTH, '--max-frames', 6, '--no-evaluate']
+    assert splatam('run', SOURCE, *few, '--out', tmp_path / 'run') == 0
+    assert 'fitting the map to all keyframes once more' in capsys.readouterr().err
+    m, frames = metrics(tmp_path / 'run'), read_run(tmp_path / 'run').frames
+    in_frames_s = sum(frame.process_ms for frame in frames) / 1e3
+    assert m['finish_s'] > 0 and m['fps'] == pytest.approx(6 / (in_frames_s + m['finish_s']), rel=1e-2)
+
+    process_frame = Slam.process
+
+    def interrupted(slam: Slam, frame: RgbdFrame) -> FrameResult:
+        signal.raise_signal(signal.SIGINT)
+        return process_frame(slam, frame)
+
+    monkeypatch.setattr(Slam, 'process', interrupted)
+    assert splatam('run', SOURCE, *few, '--out', tmp_path / 'stopped') == 130
+    assert 'once more' not in capsys.readouterr().err and metrics(tmp_path / 'stopped')['finish_s'] == 0
 
 
 # --- evaluate ---

@@ -111,6 +111,8 @@ def test_settings_that_exclude_each_other_are_refused() -> None:
         load_config('realtime', ['mapping.depth_outlier_ratio=10'])
     with pytest.raises(ConfigError, match='prune_last_opacity: fused fitting has none'):
         load_config('realtime', ['mapping.prune_last_opacity=0.1'])
+    with pytest.raises(ConfigError, match="final_passes = 3: is of fused fitting only.*'splatam refine'"):
+        load_config('quick', ['mapping.final_passes=3'])
 
 
 def test_unknown_preset_lists_the_known() -> None:

@@ -14,7 +14,7 @@ from splatam_core.config import DensificationConfig, KeyframeConfig, MappingConf
 from splatam_core.densification import densify, new_gaussians, unexplained
 from splatam_core.gaussian_map import PARAMETERS, GaussianMap
 from splatam_core.keyframes import PosedView, draw, is_due, overlaps, select_window
-from splatam_core.mapping import prunable, refine
+from splatam_core.mapping import FINAL_FIRST, FINAL_LAST, FINAL_MEANS, prunable, refine, refit
 from splatam_core.rasterizer import Gaussians, Moments, Rates, Render, Target, joined, make_rasterizer
 from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.view import View
@@ -157,6 +157,52 @@ def test_every_other_step_fits_at_half_size() -> None:
     config = load_config(overrides={'mapping.iterations': 5, 'mapping.optimizer': 'fused', 'mapping.half_size_every': 2})
     refine(_map(_view()), [PosedView(_view(), EYE)], Watched(1), config, 1.0, np.random.default_rng(0))
     assert sizes == [full := (32, 24, 32, 24, 32), half := (16, 12, 16, 12, 16), full, half, full]
+
+
+class _Listed(CpuRasterizer):
+    """Remembers what it was asked to fit."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+        self.asked: list[tuple[Rates, Target]] = []
+
+    def fit(self, gaussians: Gaussians, moments: Moments, rates: Rates, target: Target) -> float:
+        self.asked.append((rates, target))
+        return super().fit(gaussians, moments, rates, target)
+
+
+def _finishing(passes: int, **more: object) -> MappingConfig:
+    values = {'optimizer': 'fused', 'final_passes': passes} | more
+    return load_config(overrides={f'mapping.{name}': value for name, value in values.items()}).mapping
+
+
+def test_finishing_fits_every_keyframe_as_often_with_fading_steps() -> None:
+    """Each pass has all three, in an order of its own; step sizes fade evenly (by the same factor each step)."""
+    keyframes = [PosedView(_view(), _at(0.1 * i)) for i in range(3)]
+    rasterizer, config = _Listed(), _finishing(7)
+    assert refit(_map(_view()), keyframes, rasterizer, config, np.random.default_rng(0)) == 21
+    x = [round(-10 * float(target.T_cam_world[0, 3])) for _, target in rasterizer.asked]
+    passes = [tuple(x[i : i + 3]) for i in range(0, 21, 3)]
+    assert {frozenset(one) for one in passes} == {frozenset({0, 1, 2})} and len(set(passes)) > 1
+    colours = np.array([rates.rgb for rates, _ in rasterizer.asked]) / config.rgb_rate
+    fading = (FINAL_LAST / FINAL_FIRST) ** (1 / 21)
+    assert colours[0] == pytest.approx(FINAL_FIRST) and colours[-1] == pytest.approx(FINAL_LAST / fading)
+    np.testing.assert_allclose(colours[1:] / colours[:-1], fading)
+    assert rasterizer.asked[0][0].means == pytest.approx(FINAL_MEANS * FINAL_FIRST * config.means_rate)
+
+
+def test_finishing_halves_wide_keyframes_until_they_are_not() -> None:
+    keyframe = PosedView(_view(), EYE)
+    for width, fitted in ((0, 32), (32, 32), (31, 16), (8, 8)):
+        refit(_map(_view()), [keyframe], rasterizer := _Listed(), _finishing(1, final_width=width), np.random.default_rng(0))
+        assert [target.camera.width for _, target in rasterizer.asked] == [fitted]
+
+
+def test_finishing_ends_when_its_time_is_up_and_nothing_is_asked_of_it_by_default() -> None:
+    keyframe, rng = PosedView(_view(), EYE), np.random.default_rng(0)
+    assert refit(_map(_view()), [keyframe], _Listed(), _finishing(100_000_000), rng, limit_s=0.2) < 100_000_000
+    assert refit(_map(_view()), [keyframe], rasterizer := _Listed(), _finishing(0), rng) == 0 and not rasterizer.asked
+    assert refit(_map(_view()), [], _Listed(), _finishing(5), rng) == 0
 
 
 @pytest.mark.parametrize('optimizer', ['autograd', 'fused'])

@@ -97,6 +97,24 @@ def test_recording_in_poses_renders_cloud_and_folder_out(
     check_folder(out, expected_ns, expected_poses)
 
 
+def test_realtime_through_the_node_is_realtime_offline(graph: Graph, bag: Path, frames: SyntheticSequence) -> None:
+    """Poses and map to the last bit, the steps after the last frame among them."""
+    out = graph.folder / 'run'
+    node = graph.run_node(
+        preset='realtime', slam__threads=1, save_path=out, queue_policy='all', exit_on_publisher_end=True, finish_limit=600.0
+    )
+    player = graph.play(str(bag), '--rate', 'max', '--wait-for')
+    assert (player.wait(), node.wait()) == (0, 0), player.text + node.text
+    slam = Slam(load_config('realtime', ['threads=1']))
+    expected_poses = [slam.process(frame).T_world_cam for frame in frames]
+    before, steps = slam.snapshot().means, slam.finish()
+    check_folder(out, [frame.stamp_ns for frame in frames], expected_poses)
+    saved = read_ply(out / 'map.ply').means.numpy()
+    assert np.array_equal(saved, slam.snapshot().means) and not np.array_equal(saved, before)
+    assert f'fitted the map to all keyframes once more: {steps} steps' in node.text
+    assert json.loads((out / 'metrics.json').read_text())['finish_s'] > 0
+
+
 def check_map(newest: dict[str, Any], slam: Slam, T_world_cam: np.ndarray) -> None:
     view = slam.render(T_world_cam)
     np.testing.assert_array_equal(images.decode_color(newest['render/rgb']), view.rgb)
