@@ -127,7 +127,9 @@ def refit(
     for step in range(num_steps):
         if step % len(keyframes) == 0:
             order = rng.permutation(len(keyframes))
-        done = max(step / num_steps, (time.monotonic() - began_s) / limit_s)
+        done, time_used = step / num_steps, (time.monotonic() - began_s) / limit_s
+        if time_used > (step + 1) / num_steps:  # else the clock changes nothing, so that runs repeat bit for bit
+            done = time_used
         if done >= 1:
             return step
         posed = _narrowed(keyframes[order[step % len(keyframes)]], config.final_width)

@@ -79,6 +79,7 @@ DESCRIPTIONS: dict[str, tuple[Description, ...]] = {
         Description('lost', 'lost', '', 1, ',d', 'Without a pose; they change no map.'),
         Description('fps', 'speed', 'fps', 1, '.2f', 'Frames by the time spent in SLAM, decoding excluded.'),
         Description('fps_with_io', 'speed with decoding', 'fps', 1, '.2f', 'The same, decoding included.'),
+        Description('finish_s', 'fitting after the last frame', 's', 1, '.2f', 'Of the time in SLAM, that spent when all frames were done.'),
         Description('num_gaussians', 'Gaussians', '', 1, ',d', 'Size of the final map.'),
         Description('peak_rss_mb', 'peak memory', 'MiB', 1, ',.0f', 'Most memory the process held.'),
         Description('peak_gpu_mb', 'peak memory of the GPU', 'MiB', 1, ',.0f', "Most memory the process's tensors took on a GPU."),
