@@ -174,11 +174,13 @@ def _seen(
 
 def sample_points(posed: PosedView, count: int, rng: np.random.Generator) -> Tensor:
     """[count, 3] world points of random pixels with a reading, drawn with replacement; none where none has one."""
-    v, u = torch.nonzero(posed.view.valid, as_tuple=True)
-    if len(u) == 0:
-        return posed.view.depth.new_empty(0, 3)
-    drawn = torch.from_numpy(rng.integers(len(u), size=count)).to(u.device)
-    points = unproject(posed.view.camera, u[drawn], v[drawn], posed.view.depth[v[drawn], u[drawn]])
+    depth = posed.view.depth
+    with_reading = np.flatnonzero(posed.view.valid.numpy(force=True))  # eight times as fast as torch's
+    if len(with_reading) == 0:
+        return depth.new_empty(0, 3)
+    drawn = torch.from_numpy(with_reading[rng.integers(len(with_reading), size=count)]).to(depth.device)
+    v, u = drawn // depth.shape[1], drawn % depth.shape[1]
+    points = unproject(posed.view.camera, u, v, depth[v, u])
     return (points - posed.T_cam_world[:3, 3]) @ posed.T_cam_world[:3, :3]
 
 
@@ -187,8 +189,9 @@ def overlaps(points: Tensor, keyframes: Sequence[PosedView], margin: int) -> lis
     if not len(points) or not keyframes:
         return [0.0] * len(keyframes)
     camera = keyframes[0].view.camera
-    T = torch.stack([keyframe.T_cam_world[:3] for keyframe in keyframes]).to(points.device)  # [N, 3, 4]
-    x, y, z = (T[:, :, :3] @ points.T + T[:, :, 3:]).unbind(1)  # [N, K] each
+    T = torch.cat([keyframe.T_cam_world[:3] for keyframe in keyframes]).to(points.device)  # [3 N, 4]
+    homogeneous = torch.cat([points.T, points.new_ones(1, len(points))])  # [4, K]
+    x, y, z = (T @ homogeneous).view(len(keyframes), 3, -1).unbind(1)  # [N, K] each; one product, not N small ones
     u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     inside = (u > margin) & (u < camera.width - margin) & (v > margin) & (v < camera.height - margin) & (z > 0)
     return inside.float().mean(dim=1).tolist()

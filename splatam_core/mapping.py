@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from splatam_core.config import MappingConfig, SlamConfig
@@ -90,7 +91,7 @@ def _fit_fused(
         _step_fused(gaussian_map, posed, rasterizer, config, rates(config))
     if config.prune_every:
         chosen = prunable(gaussian_map, config.prune_opacity, config.prune_scale * scene_radius)
-        if chosen.sum() > config.prune_share * len(gaussian_map):
+        if torch.count_nonzero(chosen) > config.prune_share * len(gaussian_map):
             gaussian_map.keep(~chosen)
 
 
@@ -156,8 +157,12 @@ def _narrowed(posed: PosedView, max_width: int) -> PosedView:
 def prunable(gaussian_map: GaussianMap, min_opacity: float, max_scale_m: float) -> Tensor:
     """[N] Gaussians that are too faint to matter or too wide to be surface."""
     faint = gaussian_map.logit_opacities.detach() < _logit(min_opacity)
-    wide = gaussian_map.log_scales.detach().amax(dim=1) > _log(max_scale_m)
+    wide = _widest(gaussian_map.log_scales.detach()) > _log(max_scale_m)
     return faint | wide
+
+
+def _widest(log_scales: Tensor) -> Tensor:
+    return log_scales[:, 0] if log_scales.shape[1] == 1 else log_scales.amax(dim=1)  # which for one copies
 
 
 def _logit(p: float) -> float:
