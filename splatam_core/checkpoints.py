@@ -216,8 +216,10 @@ def _read_keyframe(folder: Path, digest: str, camera: PinholeCamera | None) -> P
     if camera is None:
         raise CheckpointError(f'{path}: is no keyframe of this run, which has no camera')
     arrays = unseal(path, KEYFRAME, VERSION, digest).arrays
-    size = (camera.height, camera.width)
     rgb8, depth, T_cam_world = (arrays[name] for name in ('rgb8', 'depth', 'T_cam_world'))
+    if depth.shape != (camera.height, camera.width):  # kept at another size (mapping.scale)
+        camera = camera.resized(*depth.shape[::-1])
+    size = (camera.height, camera.width)
     expected = [('uint8', (*size, 3)), ('float32', size), ('float32', (4, 4))]
     found = [(array.dtype.name, array.shape) for array in (rgb8, depth, T_cam_world)]
     if found != expected:

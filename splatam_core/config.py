@@ -217,13 +217,14 @@ class MappingConfig:
     )
     iterations: int = _setting(60, 'Optimisation steps per mapped frame.', '', 0)
     first_iterations: int = _setting(0, 'More steps on the first frame.', '', 0)
+    scale: float = _setting(1.0, 'Size at which views are fitted, and kept as keyframes, relative to the frame.', '', 0.1, 1.0)
+    max_width: int = _setting(0, 'And no wider than this; 0 = any width.', 'px', 0)
     half_size_every: int = _setting(
-        0, 'Every n-th step of a frame fits the view at half size, for a quarter of the work; 0 = none.', 'steps', 0
+        0, 'Every n-th step of a frame fits the view at half that size, for a quarter of the work; 0 = none.', 'steps', 0
     )
     final_passes: int = _setting(
         0, 'After the last frame, how often each keyframe is fitted once more, step sizes fading. Of fused fitting.', '', 0
     )
-    final_width: int = _setting(0, 'Wider keyframes are halved for that until they are not; 0 = none is.', 'px', 0)
     anisotropic: bool = _setting(
         False, 'Gaussians with three radii and a rotation instead of one radius; several times slower. Not with fused fitting.'
     )

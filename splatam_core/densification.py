@@ -20,7 +20,7 @@ def densify(
     gaussians: Gaussians, view: View, T_cam_world: Tensor, rasterizer: Rasterizer, config: DensificationConfig
 ) -> Gaussians:
     """The Gaussians to add so that the map explains the view."""
-    view = view.scaled(_scale(view, config))
+    view = view.narrowed(config.scale, config.max_width)
     with torch.no_grad():
         render = rasterizer.render(gaussians.detached(), view.camera, T_cam_world)
         chosen = unexplained(render, view, config)
@@ -31,11 +31,6 @@ def densify(
             depth = depth - depth_bias(render, view)
             new = new_gaussians(view, chosen, depth, T_cam_world, config.opacity)
     return new
-
-
-def _scale(view: View, config: DensificationConfig) -> float:
-    width = view.camera.width
-    return min(config.scale, config.max_width / width) if config.max_width else config.scale
 
 
 def depth_bias(render: Render, view: View) -> Tensor:

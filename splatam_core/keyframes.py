@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from splatam_core.camera import PinholeCamera
 from splatam_core.config import KeyframeConfig
 from splatam_core.view import View, unproject
 
@@ -97,19 +98,19 @@ class Window(Sequence[PosedView]):
         return self._store.on_device(self._views[index])
 
 
-def select_window(
+def select_keyframes(
     current: PosedView, keyframes: Sequence[PosedView], config: KeyframeConfig, rng: np.random.Generator
 ) -> list[PosedView]:
-    """The views to map: some keyframes by the configured selection, the last keyframe and the current view.
+    """Those to map with the current view: some by the configured selection, and the last. All in the host's memory.
 
     By default random ones that overlap, not the best: those are nearly the current view, and the map would forget the rest.
     """
     if not keyframes or config.window == 1:
-        return [current]
+        return []
     *earlier, last = keyframes
     count = max(0, config.window - 2)
     chosen = _SELECTIONS[config.selection](current, earlier, count, config, rng)
-    return [*(earlier[i] for i in chosen), last, current]
+    return [*(earlier[i] for i in chosen), last]
 
 
 def _overlapping(
@@ -169,27 +170,26 @@ def _seen(
     current: PosedView, keyframes: Sequence[PosedView], config: KeyframeConfig, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     points = sample_points(current, config.overlap_samples, rng)
-    return np.array(overlaps(points, keyframes, config.overlap_margin))
+    return np.array(overlaps(points, current.view.camera, keyframes, config.overlap_margin))
 
 
 def sample_points(posed: PosedView, count: int, rng: np.random.Generator) -> Tensor:
     """[count, 3] world points of random pixels with a reading, drawn with replacement; none where none has one."""
     depth = posed.view.depth
-    with_reading = np.flatnonzero(posed.view.valid.numpy(force=True))  # eight times as fast as torch's
+    with_reading = np.flatnonzero(posed.view.valid.numpy())  # eight times as fast as torch's
     if len(with_reading) == 0:
         return depth.new_empty(0, 3)
-    drawn = torch.from_numpy(with_reading[rng.integers(len(with_reading), size=count)]).to(depth.device)
+    drawn = torch.from_numpy(with_reading[rng.integers(len(with_reading), size=count)])
     v, u = drawn // depth.shape[1], drawn % depth.shape[1]
     points = unproject(posed.view.camera, u, v, depth[v, u])
     return (points - posed.T_cam_world[:3, 3]) @ posed.T_cam_world[:3, :3]
 
 
-def overlaps(points: Tensor, keyframes: Sequence[PosedView], margin: int) -> list[float]:
-    """Share of world points [K, 3] that project inside each view, more than ``margin`` pixels from its border."""
+def overlaps(points: Tensor, camera: PinholeCamera, keyframes: Sequence[PosedView], margin: int) -> list[float]:
+    """Share of world points [K, 3] that the camera, where each view was taken, has more than ``margin`` pixels inside."""
     if not len(points) or not keyframes:
         return [0.0] * len(keyframes)
-    camera = keyframes[0].view.camera
-    T = torch.cat([keyframe.T_cam_world[:3] for keyframe in keyframes]).to(points.device)  # [3 N, 4]
+    T = torch.cat([keyframe.T_cam_world[:3] for keyframe in keyframes])  # [3 N, 4]
     homogeneous = torch.cat([points.T, points.new_ones(1, len(points))])  # [4, K]
     x, y, z = (T @ homogeneous).view(len(keyframes), 3, -1).unbind(1)  # [N, K] each; one product, not N small ones
     u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy

@@ -133,7 +133,7 @@ def refit(
             done = time_used
         if done >= 1:
             return step
-        posed = _narrowed(keyframes[order[step % len(keyframes)]], config.final_width)
+        posed = keyframes[order[step % len(keyframes)]]
         _step_fused(gaussian_map, posed, rasterizer, config, _final_rates(config, done))
     return num_steps
 
@@ -145,13 +145,6 @@ def _final_rates(config: MappingConfig, done: float) -> Rates:
         FINAL_MEANS * fade * usual.means, FINAL_SCALES * fade * usual.log_scales, fade * usual.logit_opacities,
         fade * usual.rgb, fade * usual.rotations,
     )  # fmt: skip
-
-
-def _narrowed(posed: PosedView, max_width: int) -> PosedView:
-    view = posed.view
-    while max_width and view.camera.width > max_width:
-        view = view.scaled(0.5)
-    return PosedView(view, posed.T_cam_world)
 
 
 def prunable(gaussian_map: GaussianMap, min_opacity: float, max_scale_m: float) -> Tensor:

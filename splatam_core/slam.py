@@ -18,7 +18,7 @@ from splatam_core.config import SlamConfig
 from splatam_core.densification import densify
 from splatam_core.errors import ConfigError, FrameError, SplatamError
 from splatam_core.gaussian_map import GaussianMap
-from splatam_core.keyframes import KeyframeStore, PosedView, is_due, select_window
+from splatam_core.keyframes import KeyframeStore, PosedView, is_due, select_keyframes
 from splatam_core.mapping import refine, refit
 from splatam_core.motion import MotionModel, MotionPrior
 from splatam_core.rasterizer import Gaussians, make_rasterizer
@@ -105,7 +105,7 @@ class Slam:
         T_world_cam = se3.inverse(tracking.T_cam_world)
         # Depth sets the pace: a colour frame that comes late, or twice, says little about how the camera moves.
         self._motion.observe(frame.stamp_ns, se3.inverse(tracking.T_cam_world_depth))
-        is_keyframe = self._map(index, kept, _posed(view, tracking.T_cam_world), tracking.sure_fraction, clock)
+        is_keyframe = self._map(index, kept, view, tracking.T_cam_world, tracking.sure_fraction, clock)
         return self._result(index, frame, Status.TRACKED, T_world_cam, is_keyframe, clock, '',
                             tracking.sure_fraction, tracking.inlier_fraction)  # fmt: skip
 
@@ -208,7 +208,7 @@ class Slam:
             reason = f'the map cannot start: {reason}'
             return self._result(index, frame, Status.LOST, None, False, clock, reason, 0.0, 0.0)
         self._motion.observe(frame.stamp_ns, np.eye(4))
-        self._map(0, kept, _posed(view, np.eye(4)), 0.0, clock)
+        self._map(0, kept, view, np.eye(4), 0.0, clock)
         return self._result(index, frame, Status.INITIALIZED, np.eye(4), True, clock, '', 1.0, 1.0)
 
     def _why_not_to_start(self, index: int, view: View) -> str:
@@ -218,13 +218,18 @@ class Slam:
             return 'this frame is held out of it (mapping.hold_out)'
         return '' if view.valid.any() else 'no pixel has a usable depth reading'
 
-    def _map(self, index: int, kept: View, current: PosedView, sure_fraction: float, clock: _Stopwatch) -> bool:
-        """Densify, choose a window, refine; keep the host's view if it is due. Whether it was."""
+    def _map(
+        self, index: int, kept: View, view: View, T_cam_world: Matrix, sure_fraction: float, clock: _Stopwatch
+    ) -> bool:
+        """Densify, choose a window, refine; keep the view that was fitted, on the host, if it is due. Whether it was."""
         config = self.config
         if not config.mapping.enabled or config.mapping.is_held_out(index):
             return False
         index -= config.mapping.num_held_out(index)  # what is held out leaves the rhythm of the others as it is
-        self._scene_radius = self._scene_radius or float(current.view.depth.max()) / config.mapping.scene_radius_ratio
+        self._scene_radius = self._scene_radius or float(kept.depth.max()) / config.mapping.scene_radius_ratio
+        current = _posed(view, T_cam_world)
+        keyframe = _posed(kept.narrowed(config.mapping.scale, config.mapping.max_width), T_cam_world)
+        to_fit = current if keyframe.view is kept else keyframe.to(self.backend.device)
         mapped, every = divmod(index, config.mapping.every)
         if every == 0:
             if mapped % config.densification.every == 0 or sure_fraction < config.densification.when_unsure:
@@ -232,15 +237,16 @@ class Slam:
                     densify(self.map.gaussians, current.view, current.T_cam_world, self._rasterizer, config.densification)
                 )
                 clock.lap('densify')
-            window = self._keyframes.window(select_window(current, self._keyframes, config.keyframes, self._rng))
+            chosen = select_keyframes(_posed(kept, T_cam_world), self._keyframes, config.keyframes, self._rng)
+            window = self._keyframes.window([*chosen, to_fit])
             clock.lap('keyframes')
             more = config.mapping.first_iterations if index == 0 else 0
             refine(self.map, window, self._rasterizer, config, self._scene_radius, self._rng, more)
             clock.lap('map')
         is_keyframe = is_due(index, config.keyframes, self._all_frames)
         if is_keyframe:
-            T_cam_world = current.T_cam_world.to(kept.depth.device)
-            self._keyframes.append(PosedView(replace(kept), T_cam_world), current)  # without what the view has cached
+            without_cached = PosedView(replace(keyframe.view), keyframe.T_cam_world)
+            self._keyframes.append(without_cached, to_fit)
         return is_keyframe
 
     def _motion_model(self) -> MotionModel:

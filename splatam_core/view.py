@@ -60,6 +60,10 @@ class View:
         size = max(1, round(self.camera.width * scale)), max(1, round(self.camera.height * scale))
         return View(self.camera.resized(*size), shrunk(self.rgb8, *size), nearest(self.depth, *size))
 
+    def narrowed(self, scale: float, max_width: int) -> View:
+        """The same view at a scale, or at the one that makes it ``max_width`` pixels wide, if that is less; 0 = any width."""
+        return self.scaled(min(scale, max_width / self.camera.width) if max_width else scale)
+
     def points(self, chosen: Tensor) -> Tensor:
         """[K, 3] camera coordinates of the pixels where ``chosen`` [H, W] is true, row by row."""
         v, u = torch.nonzero(chosen, as_tuple=True)

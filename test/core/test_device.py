@@ -13,7 +13,7 @@ import pytest
 import torch
 from second_device import DEVICE, DeviceRasterizer, DeviceTensor, SecondDevice
 
-from splatam_core import densification, keyframes, slam
+from splatam_core import densification, slam
 from splatam_core.backend import Backend
 from splatam_core.camera import PinholeCamera
 from splatam_core.config import SlamConfig, TrackingConfig, load_config
@@ -121,7 +121,7 @@ def test_keyframes_are_in_the_hosts_memory_and_a_bounded_number_on_the_device() 
 
 
 def test_a_frame_goes_to_the_device_once(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As a frame, as a keyframe, and as one of a later window; none of them is read back."""
+    """To be tracked and, smaller, to be fitted: then, as a keyframe, and in a later window. None is read back."""
     sequence, brought = room(6, WIDTH), []
     original = View.to
 
@@ -135,7 +135,7 @@ def test_a_frame_goes_to_the_device_once(room: Room, monkeypatch: pytest.MonkeyP
         slam = Slam(_config('realtime'))
         for index in range(6):
             slam.process(sequence[index])
-    assert len(brought) == 6
+    assert sorted(view.camera.width for view in brought) == [WIDTH * 3 // 4] * 6 + [WIDTH] * 6
     assert len(slam._keyframes) == 3
 
 
@@ -203,7 +203,6 @@ def test_refining_a_map_happens_on_the_device(room: Room, monkeypatch: pytest.Mo
     ('module', 'name', 'wrong'),
     [
         (densification, 'box_sums', lambda image, side: torch.zeros(image.shape)),
-        (keyframes, 'unproject', lambda camera, u, v, z: torch.zeros(len(u), 3)),
         (slam, 'pose_tensor', lambda T, device: torch.from_numpy(T).float()),
     ],
 )

@@ -13,7 +13,7 @@ from splatam_core.camera import PinholeCamera
 from splatam_core.config import DensificationConfig, KeyframeConfig, MappingConfig, load_config
 from splatam_core.densification import densify, new_gaussians, unexplained
 from splatam_core.gaussian_map import PARAMETERS, GaussianMap
-from splatam_core.keyframes import PosedView, draw, is_due, overlaps, select_window
+from splatam_core.keyframes import PosedView, draw, is_due, overlaps, select_keyframes
 from splatam_core.mapping import FINAL_FIRST, FINAL_LAST, FINAL_MEANS, prunable, refine, refit
 from splatam_core.rasterizer import Gaussians, Moments, Rates, Render, Target, joined, make_rasterizer
 from splatam_core.rasterizer.cpu import CpuRasterizer
@@ -191,11 +191,11 @@ def test_finishing_fits_every_keyframe_as_often_with_fading_steps() -> None:
     assert rasterizer.asked[0][0].means == pytest.approx(FINAL_MEANS * FINAL_FIRST * config.means_rate)
 
 
-def test_finishing_halves_wide_keyframes_until_they_are_not() -> None:
-    keyframe = PosedView(_view(), EYE)
-    for width, fitted in ((0, 32), (32, 32), (31, 16), (8, 8)):
-        refit(_map(_view()), [keyframe], rasterizer := _Listed(), _finishing(1, final_width=width), np.random.default_rng(0))
-        assert [target.camera.width for _, target in rasterizer.asked] == [fitted]
+@pytest.mark.parametrize(('scale', 'max_width', 'width'), [(1.0, 0, 32), (0.75, 0, 24), (0.75, 30, 24), (0.75, 20, 20)])
+def test_views_are_made_smaller_by_scale_and_width(scale: float, max_width: int, width: int) -> None:
+    view = _view().narrowed(scale, max_width)
+    assert view.camera.width == view.rgb8.shape[1] == view.depth.shape[1] == width
+    assert view.camera == _view().camera.resized(width, width * 3 // 4)
 
 
 def test_finishing_ends_when_its_time_is_up_and_nothing_is_asked_of_it_by_default() -> None:
@@ -303,10 +303,10 @@ def test_overlap_is_the_share_seen_inside_the_margin() -> None:
     view = _view()
     points = view.points(view.valid)
     here, behind = PosedView(view, EYE), PosedView(view, _at(0.0, math.pi))
-    assert overlaps(points, [here, behind], 0) == pytest.approx([1.0, 0.0], abs=0.1)  # the outermost are on the rim
-    assert overlaps(points, [here], 8) == pytest.approx([15 * 7 / 768], abs=0.01)
-    assert overlaps(points[:0], [here], 0) == [0.0]
-    assert overlaps(points, [], 0) == []
+    assert overlaps(points, view.camera, [here, behind], 0) == pytest.approx([1.0, 0.0], abs=0.1)  # the outermost are on the rim
+    assert overlaps(points, view.camera, [here], 8) == pytest.approx([15 * 7 / 768], abs=0.01)
+    assert overlaps(points[:0], view.camera, [here], 0) == [0.0]
+    assert overlaps(points, view.camera, [], 0) == []
 
 
 def test_the_current_view_gets_its_share_of_the_steps() -> None:
@@ -365,19 +365,18 @@ def test_bounds_follow_what_fitting_moves() -> None:
     assert gaussian_map.log_scales.max() <= bounds[0, 6]
 
 
-def test_window_holds_overlapping_keyframes_the_last_and_the_current() -> None:
+def test_overlapping_keyframes_and_the_last_are_mapped_with_the_current_view() -> None:
     view = _view()
     near = [PosedView(view, _at(0.01 * k)) for k in range(6)]
     away = [PosedView(view, _at(0.0, math.pi)) for _ in range(4)]
     last, current = PosedView(view, _at(9.0)), PosedView(view, EYE)
     config = KeyframeConfig(window=5, overlap_margin=2)
     rng = np.random.default_rng(0)
-    windows = [select_window(current, [*near, *away, last], config, rng) for _ in range(20)]
+    windows = [select_keyframes(current, [*near, *away, last], config, rng) for _ in range(20)]
     for window in windows:
-        assert len(window) == 5
-        assert window[-2] is last and window[-1] is current
-        assert all(any(w is k for k in near) for w in window[:-2])
-        assert len({id(w) for w in window}) == 5
+        assert len(window) == 4 and window[-1] is last
+        assert all(any(w is k for k in near) for w in window[:-1])
+        assert len({id(w) for w in window}) == 4
     assert len({frozenset(map(id, window)) for window in windows}) > 1  # random, not always the same
 
 
@@ -386,22 +385,22 @@ def test_window_holds_overlapping_keyframes_the_last_and_the_current() -> None:
     [('most_overlap', {0, 1, 2}), ('latest', {7, 8, 9}), ('uniform', {0, 4, 9}), ('random', None)],
 )
 def test_other_selections_of_keyframes(selection: str, expected: set[int] | None) -> None:
-    """Ten keyframes that overlap the less the later they are, then the last and the current view."""
+    """Ten keyframes that overlap the less the later they are, then the last."""
     view = _view()
     keyframes = [PosedView(view, _at(0.0, 0.07 * k)) for k in range(10)]
     last, current = PosedView(view, _at(9.0)), PosedView(view, EYE)
     config = KeyframeConfig(window=5, overlap_margin=0, overlap_samples=4000, selection=selection)
     rng = np.random.default_rng(0)
-    windows = [select_window(current, [*keyframes, last], config, rng) for _ in range(20)]
-    chosen = [{next(i for i, k in enumerate(keyframes) if k is w) for w in window[:-2]} for window in windows]
-    assert all(window[-2] is last and window[-1] is current for window in windows)
+    windows = [select_keyframes(current, [*keyframes, last], config, rng) for _ in range(20)]
+    chosen = [{next(i for i, k in enumerate(keyframes) if k is w) for w in window[:-1]} for window in windows]
+    assert all(window[-1] is last for window in windows)
     assert all(len(some) == 3 for some in chosen)
     if expected is None:
         assert set.union(*chosen) == set(range(10))
     else:
         assert all(some == expected for some in chosen)
-    few = select_window(current, [*keyframes[:2], last], config, rng)
-    assert {id(w) for w in few} == {id(w) for w in (*keyframes[:2], last, current)}
+    few = select_keyframes(current, [*keyframes[:2], last], config, rng)
+    assert {id(w) for w in few} == {id(w) for w in (*keyframes[:2], last)}
 
 
 @pytest.mark.parametrize(
@@ -420,8 +419,8 @@ def test_which_frames_are_kept(config: KeyframeConfig, num_frames: int | None, k
     assert [i for i in range(num_frames or 12) if is_due(i, config, num_frames)] == kept
 
 
-def test_window_of_one_and_of_the_first_frame() -> None:
+def test_no_keyframe_is_mapped_with_the_first_frame_or_in_a_window_of_one() -> None:
     current = PosedView(_view(), EYE)
     rng = np.random.default_rng(0)
-    assert select_window(current, [], KeyframeConfig(), rng) == [current]
-    assert select_window(current, [current], KeyframeConfig(window=1), rng) == [current]
+    assert select_keyframes(current, [], KeyframeConfig(), rng) == []
+    assert select_keyframes(current, [current], KeyframeConfig(window=1), rng) == []

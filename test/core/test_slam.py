@@ -11,9 +11,10 @@ import torch
 
 from splatam_core import se3
 from splatam_core.camera import PinholeCamera
-from splatam_core.config import TrackingConfig, load_config
+from splatam_core.config import KeyframeConfig, TrackingConfig, load_config
 from splatam_core.datasets import open_sequence
 from splatam_core.errors import ConfigError, FrameError, SplatamError
+from splatam_core.keyframes import PosedView, draw
 from splatam_core.motion import MotionModel
 from splatam_core.rasterizer import Render, make_rasterizer
 from splatam_core.rasterizer.cpu import CpuRasterizer
@@ -318,6 +319,26 @@ def test_keyframes_keep_no_more_than_the_images(room: tuple[list[RgbdFrame], lis
         slam.process(frame)
     for keyframe in slam._keyframes:
         assert set(vars(keyframe.view)) == {'camera', 'rgb8', 'depth'}
+
+
+@pytest.mark.parametrize('optimizer', ['fused', 'autograd'])
+def test_views_are_fitted_and_kept_at_the_size_of_mapping(
+    optimizer: str, room: tuple[list[RgbdFrame], list[np.ndarray]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Keyframes chosen later too; the camera of the frames stays what it was."""
+    fitted: list[int] = []
+
+    def noted(window: Sequence[PosedView], config: KeyframeConfig, rng: np.random.Generator) -> PosedView:
+        fitted.extend(posed.view.camera.width for posed in window)
+        return draw(window, config, rng)
+
+    monkeypatch.setattr('splatam_core.mapping.draw', noted)
+    slam = _slam(f'mapping.optimizer={optimizer}', 'mapping.scale=0.75', 'mapping.max_width=60', 'keyframes.every=2')
+    results = [slam.process(frame) for frame in room[0][:6]]
+    assert all(result.T_world_cam is not None for result in results) and set(fitted) == {60}
+    cameras = [keyframe.view.camera for keyframe in slam.state().keyframes]
+    assert cameras == [room[0][0].camera.resized(60, 45)] * 3 and slam.camera == room[0][0].camera
+    assert len(fitted) == slam.config.mapping.iterations * (1 + 2 + 3)  # of every second frame, with its keyframes
 
 
 def test_tracking_never_returns_a_pose_worse_than_its_guess(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
