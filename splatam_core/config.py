@@ -218,7 +218,7 @@ class MappingConfig:
     iterations: int = _setting(60, 'Optimisation steps per mapped frame.', '', 0)
     first_iterations: int = _setting(0, 'More steps on the first frame.', '', 0)
     scale: float = _setting(1.0, 'Size at which views are fitted, and kept as keyframes, relative to the frame.', '', 0.1, 1.0)
-    max_width: int = _setting(0, 'The same in pixels, at most; 0 = any. Bounds the work of a step, however large frames are.', 'px', 0)
+    max_width: int = _setting(0, 'The same in pixels, at most; 0 = any. Bounds the work of a step on large frames.', 'px', 0)
     half_size_every: int = _setting(
         0, 'Every n-th step of a frame fits the view at half that size, for a quarter of the work; 0 = none.', 'steps', 0
     )
