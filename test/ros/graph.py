@@ -103,8 +103,13 @@ class Process:
         wait_until(lambda: self.says(*parts) or not self.is_running, timeout_s, lambda: self.text)
         assert self.says(*parts), f'not said: {parts}; but:\n{self.text}'
 
-    def end(self) -> None:
+    def end(self, grace_s: float = 3.0) -> None:
+        """Asked first: a participant that is killed leaves its shared memory, 35 MB, behind."""
         if self.is_running:
+            self.send(signal.SIGTERM)
+        try:
+            self._process.wait(grace_s)
+        except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
 
