@@ -106,7 +106,8 @@ class Checkpoints:
         """
         self._folder = folder
         self._keep = keep
-        self._written: list[tuple[PosedView, str]] = []
+        self._written: dict[PosedView, str] = {}
+        self._needed: dict[Path, frozenset[str]] = {}
 
     def save(self, state: SlamState, progress: Progress) -> Path:
         """Write a checkpoint, then remove what is too old. Returns the new file's path.
@@ -115,33 +116,44 @@ class Checkpoints:
             OSError: it cannot be written; the checkpoints that are there stay.
         """
         (self._folder / KEYFRAMES).mkdir(parents=True, exist_ok=True)
-        digests = [self._write_keyframe(index, keyframe) for index, keyframe in enumerate(state.keyframes)]
+        self._written = {keyframe: self._write_keyframe(keyframe) for keyframe in state.keyframes}
+        digests = tuple(self._written.values())
         path = self._folder / f'{progress.num_lines:06d}.{KIND}'
         seal(KIND, VERSION, _pack(state, progress, digests)).write(path)
-        self._remove_old(set(digests))
+        self._needed[path] = frozenset(digests)
+        self._remove_old()
         return path
 
-    def _write_keyframe(self, index: int, keyframe: PosedView) -> str:
-        if index < len(self._written) and self._written[index][0] is keyframe:
-            return self._written[index][1]
+    def _write_keyframe(self, keyframe: PosedView) -> str:
+        if keyframe in self._written:
+            return self._written[keyframe]
         arrays = {
             'rgb8': keyframe.view.rgb8.numpy(force=True), 'depth': keyframe.view.depth.numpy(force=True),
             'T_cam_world': keyframe.T_cam_world.numpy(force=True),
         }  # fmt: skip
         file = seal(KEYFRAME, VERSION, Content({}, arrays))
         file.write(_keyframe_path(self._folder, file.digest))
-        self._written[index:] = [(keyframe, file.digest)]
         return file.digest
 
-    def _remove_old(self, digests: set[str]) -> None:
-        """Older checkpoints of a run refer to no keyframe that the newest does not."""
-        for path in checkpoint_paths(self._folder)[: -self._keep]:
+    def _remove_old(self) -> None:
+        paths = checkpoint_paths(self._folder)
+        for path in paths[: -self._keep]:
             path.unlink(missing_ok=True)
+        needed = {digest for path in paths[-self._keep :] for digest in self._digests_in(path)}
         for path in (self._folder / KEYFRAMES).glob(f'*.{KEYFRAME}'):
-            if path.stem not in digests:
+            if path.stem not in needed:
                 path.unlink(missing_ok=True)
         for path in list(_unfinished(self._folder)):
             path.unlink(missing_ok=True)
+
+    def _digests_in(self, path: Path) -> frozenset[str]:
+        """Keyframes of a checkpoint; a newer one need not have them all (``keyframes.budget``)."""
+        if path not in self._needed:  # written before the run was resumed
+            try:
+                self._needed[path] = frozenset(unseal(path, KIND, VERSION).values['keyframes'])
+            except (CheckpointError, KeyError, TypeError):
+                self._needed[path] = frozenset()  # it cannot be used anyway
+        return self._needed[path]
 
 
 def checkpoint_paths(folder: Path) -> list[Path]:
@@ -217,7 +229,7 @@ def _read_keyframe(folder: Path, digest: str, camera: PinholeCamera | None) -> P
         raise CheckpointError(f'{path}: is no keyframe of this run, which has no camera')
     arrays = unseal(path, KEYFRAME, VERSION, digest).arrays
     rgb8, depth, T_cam_world = (arrays[name] for name in ('rgb8', 'depth', 'T_cam_world'))
-    if depth.shape != (camera.height, camera.width):  # kept at another size (mapping.scale)
+    if depth.ndim == 2 and depth.shape != (camera.height, camera.width):  # kept at another size (mapping.scale)
         camera = camera.resized(*depth.shape[::-1])
     size = (camera.height, camera.width)
     expected = [('uint8', (*size, 3)), ('float32', size), ('float32', (4, 4))]

@@ -100,11 +100,10 @@ def run(args: argparse.Namespace) -> int:
     try:
         with job.folder, _StopRequest() as stop:
             failure = _process(job, stop)
-            if failure is not None or stop.requested:
+            is_whole = failure is None and not stop.requested
+            if not is_whole:
                 job.checkpoints.at_stop(job.slam)
-                finish_s = 0.0
-            else:
-                finish_s = _finish(job)
+            finish_s = _finish(job, stop) if is_whole else 0.0
             metrics = job.folder.finish(job.slam, finish_s)
     except OSError as error:
         raise RunFolderError(f'{path}: cannot be written: {error.strerror}; make room{_resume_hint(path)}') from None
@@ -112,7 +111,8 @@ def run(args: argparse.Namespace) -> int:
         say(f'what was done before the error is in {path}{_resume_hint(path)}')
         raise failure
     if stop.requested:
-        say(f'stopped after {metrics.frames} of {length} frames; all of it is in {path}{_resume_hint(path)}')
+        what = f'after {metrics.frames} of {length} frames' if not is_whole else 'while the map was fitted once more'
+        say(f'stopped {what}; all of it is in {path}{_resume_hint(path)}')
         say(f"'splatam evaluate {path}' scores it")
         return EXIT_INTERRUPTED
     if metrics.frames == 0:
@@ -200,10 +200,11 @@ def _resume_hint(path: Path) -> str:
 
 
 class _StopRequest:
-    """Turns Ctrl-C into a request to stop after the frame; a second one interrupts at once."""
+    """Turns Ctrl-C into a request to stop after the frame, or after the step; a second one interrupts at once."""
 
     def __init__(self) -> None:
         self.requested = False
+        self.when = 'after this frame'
 
     def __enter__(self) -> _StopRequest:
         self._previous = signal.signal(signal.SIGINT, self._request)
@@ -217,15 +218,16 @@ class _StopRequest:
     def _request(self, number: int, frame: FrameType | None) -> None:
         self.requested = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        say('stopping after this frame; Ctrl-C again stops at once, without saving the map')
+        say(f'stopping {self.when}; Ctrl-C again stops at once, without saving the map')
 
 
-def _finish(job: _Job) -> float:
+def _finish(job: _Job, stop: _StopRequest) -> float:
     """Fit the map once more, where the settings ask for it; the seconds that took."""
+    stop.when = 'where the map is by now'
     if job.slam.config.mapping.final_passes:
         say('all frames are processed; fitting the map to all keyframes once more')
     begin = time.perf_counter()
-    job.slam.finish()
+    job.slam.finish(stop=lambda: stop.requested)
     return time.perf_counter() - begin
 
 

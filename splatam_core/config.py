@@ -167,7 +167,7 @@ class DensificationConfig:
         0.0, 'Add on other frames too, where a smaller share of the pixels with depth sees sure map.', '', 0.0, 1.0
     )
     scale: float = _setting(1.0, 'Resolution at which Gaussians are added, relative to the frame.', '', 0.05, 1.0)
-    max_width: int = _setting(0, 'The same in pixels, at most; 0 = any. Bounds how many are added, however large frames are.', 'px', 0)
+    max_width: int = _setting(0, 'Width at which Gaussians are added, at most, however large frames are; 0 = any.', 'px', 0)
     silhouette_threshold: float = _setting(0.5, 'Add where the silhouette is below this.', '', 0.0, 1.0)
     depth_error_ratio: float = _setting(
         50.0, 'Also add where the reading is in front of the map by more than this many median errors.', '', 0.0
@@ -199,6 +199,10 @@ class KeyframeConfig:
     )
     overlap_samples: int = _setting(1600, 'Pixels sampled to measure overlap with a keyframe.', 'px', 1)
     overlap_margin: int = _setting(20, 'Border of a keyframe in which a sample does not count as seen.', 'px', 0)
+    budget: int = _setting(
+        0, 'Keyframes at most: where there are more, one whose neighbours in time lie nearest to each other goes; 0 = any '
+        'number, which a camera that runs for hours must not have.', 'frames', 0,
+    )  # fmt: skip
     on_device: int = _setting(
         100, "Of a GPU: keyframes in its memory at most, those used last, 20 bytes a pixel each; all are in the host's.",
         'frames', 1,
@@ -218,9 +222,9 @@ class MappingConfig:
     iterations: int = _setting(60, 'Optimisation steps per mapped frame.', '', 0)
     first_iterations: int = _setting(0, 'More steps on the first frame.', '', 0)
     scale: float = _setting(1.0, 'Size at which views are fitted, and kept as keyframes, relative to the frame.', '', 0.1, 1.0)
-    max_width: int = _setting(0, 'The same in pixels, at most; 0 = any. Bounds the work of a step on large frames.', 'px', 0)
+    max_width: int = _setting(0, 'Width at which views are fitted, at most, however large frames are; 0 = any.', 'px', 0)
     half_size_every: int = _setting(
-        0, 'Every n-th step of a frame fits the view at half that size, for a quarter of the work; 0 = none.', 'steps', 0
+        0, 'Every n-th step of a frame fits the view at half of its size, for a quarter of the work; 0 = none.', 'steps', 0
     )
     final_passes: int = _setting(
         0, 'After the last frame, how often each keyframe is fitted once more, step sizes fading. Of fused fitting.', '', 0
@@ -239,13 +243,13 @@ class MappingConfig:
     depth_outlier_ratio: float = _setting(
         0.0, 'Readings count up to this many median depth errors; 0 = all. Not of fused fitting.', '', 0.0
     )
-    ssim_weight: float = _setting(0.2, 'Share of 1 - SSIM in the colour loss; the rest is L1.', '', 0.0, 1.0)
+    ssim_weight: float = _setting(0.2, 'Share of 1 - SSIM in the colour loss; the rest is L1. Not of fused fitting.', '', 0.0, 1.0)
     means_rate: float = _setting(1e-4, 'Adam step of the centres.', 'm', 0.0)
     rgb_rate: float = _setting(2.5e-3, 'Adam step of the colours.', '', 0.0)
     opacity_rate: float = _setting(0.05, 'Adam step of the opacity logits.', '', 0.0)
     scale_rate: float = _setting(1e-3, 'Adam step of the log scales.', '', 0.0)
     rotation_rate: float = _setting(1e-3, "Adam step of anisotropic Gaussians' unit quaternions.", '', 0.0)
-    prune_every: int = _setting(20, 'Prune before every n-th step of a frame; 0 = never.', 'steps', 0)
+    prune_every: int = _setting(20, 'Prune before every n-th step of a frame; fused fitting, after the last step of each; 0 = never.', 'steps', 0)
     prune_from: int = _setting(0, 'First step of a frame that may prune. Not of fused fitting.', 'steps', 0)
     prune_until: int = _setting(20, 'Last step of a frame that may prune or reset opacities. Not of fused fitting.', 'steps', 0)
     prune_opacity: float = _setting(0.005, 'Prune Gaussians fainter than this.', '', 0.0, 1.0)
@@ -261,7 +265,8 @@ class MappingConfig:
     prune_share: float = _setting(
         0.0, 'Of fused fitting: prune only once this share of the map is to go; the map is copied then.', '', 0.0, 1.0
     )
-    scene_radius_ratio: float = _setting(3.0, 'Scene radius = deepest reading of the first frame / this.', '', 0.1)
+    scene_radius_ratio: float = _setting(3.0, 'Scene radius = deepest reading of the first frame / this; more once a later one sees so far that new '
+        'Gaussians would be too wide.', '', 0.1)
 
     def is_held_out(self, index: int) -> bool:
         """Whether a frame, counted from 0, is kept out of the map: frames n - 1, 2n - 1, ..."""
@@ -372,11 +377,8 @@ def with_values(config: SlamConfig, values: Mapping[str, object]) -> SlamConfig:
         )
     if config.mapping.optimizer == 'fused':
         _check_fused(config.mapping)
-    elif config.mapping.final_passes:
-        raise ConfigError(
-            f'mapping.final_passes = {config.mapping.final_passes}: is of fused fitting only; set it to 0, or '
-            "mapping.optimizer=fused; 'splatam refine' fits a finished map by autograd"
-        )
+    else:
+        _check_not_fused(config.mapping)
     return config
 
 
@@ -390,6 +392,14 @@ def _check_fused(config: MappingConfig) -> None:
     for name in ('depth_outlier_ratio', 'prune_from', 'prune_last_opacity', 'prune_scale_from', 'reset_opacity_every'):
         if getattr(config, name) > 0:
             raise ConfigError(f'mapping.{name}: fused fitting has none; set it to 0, or mapping.optimizer=autograd')
+
+
+def _check_not_fused(config: MappingConfig) -> None:
+    for name, hint in (('final_passes', "; 'splatam refine' fits a finished map by autograd"), ('prune_share', '')):
+        if value := getattr(config, name):
+            raise ConfigError(
+                f'mapping.{name} = {value:g}: is of fused fitting only; set it to 0, or mapping.optimizer=fused{hint}'
+            )
 
 
 def flat_values(config: SlamConfig) -> dict[str, Value]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from torch import Tensor
 
 from splatam_core.backend import HOST
@@ -57,16 +57,6 @@ class GaussianMap:
         self._bounds = torch.empty(0, 7, device=device)
         self._optimizer: torch.optim.Adam | None = None
         self._show()
-
-    @classmethod
-    def from_arrays(
-        cls, means: ArrayLike, log_scales: ArrayLike, logit_opacities: ArrayLike, rgb: ArrayLike
-    ) -> GaussianMap:
-        """A map of given Gaussians, shapes as in the class."""
-        result = cls()
-        arrays = (np.array(values, dtype=np.float32) for values in (means, log_scales, logit_opacities, rgb))
-        result.append(Gaussians(*map(torch.from_numpy, arrays)))
-        return result
 
     def __len__(self) -> int:
         return self._size

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,16 +35,20 @@ class PosedView:
             return self
         return PosedView(self.view.to(device), self.T_cam_world.to(device, non_blocking=True))
 
+    def bare(self) -> PosedView:
+        """The same without what its view has worked out: seven bytes a pixel."""
+        return PosedView(replace(self.view), self.T_cam_world)
+
 
 class KeyframeStore(Sequence[PosedView]):
-    """All keyframes, in the host's memory; copies of those used last are on the device.
+    """Keyframes, in the host's memory; copies of those used last are on the device.
 
     Attributes:
-        limit: how many may be on the device.
+        config: how many there may be, and how many of them on the device.
     """
 
-    def __init__(self, device: torch.device, limit: int) -> None:
-        self.limit = limit
+    def __init__(self, device: torch.device, config: KeyframeConfig) -> None:
+        self.config = config
         self._device = device
         self._kept: list[PosedView] = []
         self._copies: dict[PosedView, PosedView] = {}  # the last used is the last
@@ -56,20 +61,22 @@ class KeyframeStore(Sequence[PosedView]):
         return self._kept[index]
 
     def append(self, keyframe: PosedView, copy: PosedView | None = None) -> None:
-        """Keep one.
+        """Keep one more, in place of the least needed where there are as many as may be.
 
         Args:
             keyframe: in the host's memory.
             copy: the same on the device, if it is there.
         """
         self._kept.append(keyframe)
+        if 0 < self.config.budget < len(self._kept):
+            self._copies.pop(self._kept.pop(least_needed(self._kept)), None)
         if copy is not None and copy.view.depth.device != keyframe.view.depth.device:
             self._remember(keyframe, copy)
 
     def on_device(self, keyframe: PosedView) -> PosedView:
         """A view on the device; brought there unless it is."""
         if keyframe.view.depth.device == self._device:
-            return keyframe
+            return keyframe.bare()
         copy = self._copies.pop(keyframe, None) or keyframe.to(self._device)
         self._remember(keyframe, copy)
         return copy
@@ -80,8 +87,23 @@ class KeyframeStore(Sequence[PosedView]):
 
     def _remember(self, keyframe: PosedView, copy: PosedView) -> None:
         self._copies[keyframe] = copy
-        while len(self._copies) > self.limit:
+        while len(self._copies) > self.config.on_device:
             del self._copies[next(iter(self._copies))]
+
+
+def least_needed(keyframes: Sequence[PosedView]) -> int:
+    """Which to let go: the one whose neighbours in time are nearest to each other, not the first or last of three or more.
+
+    Near: few metres and radians apart; what is a metre away moves as far in the image by the one as by the other.
+    """
+    if len(keyframes) < 3:
+        return 0
+    T = torch.stack([keyframe.T_cam_world for keyframe in keyframes])
+    R, t = T[:, :3, :3], T[:, :3, 3:]
+    centres = -(R.mT @ t).squeeze(2)
+    between = torch.linalg.norm(centres[2:] - centres[:-2], dim=1)
+    turned = torch.linalg.matrix_norm(R[2:] - R[:-2]) / math.sqrt(2)  # 2 sin(angle / 2)
+    return 1 + int(torch.argmin(between + turned))
 
 
 class Window(Sequence[PosedView]):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import torch
@@ -110,6 +110,7 @@ def refit(
     config: MappingConfig,
     rng: np.random.Generator,
     limit_s: float = math.inf,
+    stop: Callable[[], bool] = lambda: False,
 ) -> int:
     """Fit the map to all keyframes in turn, poses fixed, step sizes fading: what few steps a frame forgot comes back.
 
@@ -120,6 +121,7 @@ def refit(
         config: passes, weights, rates.
         rng: draws the order of each pass.
         limit_s: seconds after which the step sizes have faded, however many steps that were.
+        stop: asked before each step; where it says so, the last one was taken.
 
     Returns:
         How many steps it took.
@@ -128,10 +130,10 @@ def refit(
     for step in range(num_steps):
         if step % len(keyframes) == 0:
             order = rng.permutation(len(keyframes))
-        done, time_used = step / num_steps, (time.monotonic() - began_s) / limit_s
+        done, time_used = step / num_steps, (time.monotonic() - began_s) / max(limit_s, 1e-9)
         if time_used > (step + 1) / num_steps:  # else the clock changes nothing, so that runs repeat bit for bit
             done = time_used
-        if done >= 1:
+        if done >= 1 or stop():
             return step
         posed = keyframes[order[step % len(keyframes)]]
         _step_fused(gaussian_map, posed, rasterizer, config, _final_rates(config, done))

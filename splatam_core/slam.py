@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import math
-import time
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from splatam_core import se3
-from splatam_core.backend import choose_backend, finish, pose_tensor
+from splatam_core.backend import choose_backend, pose_tensor
 from splatam_core.camera import PinholeCamera
 from splatam_core.checkpoints import SlamState
 from splatam_core.config import SlamConfig
-from splatam_core.densification import densify
 from splatam_core.errors import ConfigError, FrameError, SplatamError
 from splatam_core.gaussian_map import GaussianMap
-from splatam_core.keyframes import KeyframeStore, PosedView, is_due, select_keyframes
-from splatam_core.mapping import refine, refit
+from splatam_core.mapper import Mapper
 from splatam_core.motion import MotionModel, MotionPrior
 from splatam_core.rasterizer import Gaussians, make_rasterizer
+from splatam_core.stopwatch import Stopwatch
 from splatam_core.tracking import make_tracker
-from splatam_core.types import FrameResult, MapSnapshot, RenderedView, RgbdFrame, StageTimings, Status
+from splatam_core.types import FrameResult, MapSnapshot, RenderedView, RgbdFrame, Status
 from splatam_core.view import View
 
 Matrix = NDArray[np.float64]
@@ -35,7 +33,6 @@ class Slam:
     Attributes:
         config: all settings.
         backend: where it is computed.
-        map: the Gaussians, there.
         camera: of the frames; None before the first.
     """
 
@@ -64,14 +61,16 @@ class Slam:
 
     def reset(self) -> None:
         """Forget map, poses and camera; the next frame starts a new world."""
-        self.map = GaussianMap(self.config.mapping.anisotropic, self.backend.device)
-        self.camera: PinholeCamera | None = None
-        self._keyframes = KeyframeStore(self.backend.device, self.config.keyframes.on_device)
+        self._mapper = self._new_mapper()
         self._motion = self._motion_model()
-        self._rng = np.random.default_rng(self.config.seed)
-        self._scene_radius = 0.0
+        self.camera: PinholeCamera | None = None
         self._num_frames = 0
         self._last_stamp_ns: int | None = None
+
+    @property
+    def map(self) -> GaussianMap:
+        """The Gaussians, on the backend's device."""
+        return self._mapper.map
 
     @property
     def num_gaussians(self) -> int:
@@ -85,7 +84,7 @@ class Slam:
             FrameError: the frame is of another camera than the first, or not later than the last.
         """
         self._check(frame)
-        clock = _Stopwatch(self.backend.device)
+        clock = Stopwatch(self.backend.device)
         index, self._num_frames, self._last_stamp_ns = self._num_frames, self._num_frames + 1, frame.stamp_ns
         kept = View.from_frame(frame, self.config.depth)
         view = kept.to(self.backend.device)
@@ -105,7 +104,7 @@ class Slam:
         T_world_cam = se3.inverse(tracking.T_cam_world)
         # Depth sets the pace: a colour frame that comes late, or twice, says little about how the camera moves.
         self._motion.observe(frame.stamp_ns, se3.inverse(tracking.T_cam_world_depth))
-        is_keyframe = self._map(index, kept, view, tracking.T_cam_world, tracking.sure_fraction, clock)
+        is_keyframe = self._mapper.add(index, kept, view, tracking.T_cam_world, tracking.sure_fraction, clock)
         return self._result(index, frame, Status.TRACKED, T_world_cam, is_keyframe, clock, '',
                             tracking.sure_fraction, tracking.inlier_fraction)  # fmt: skip
 
@@ -117,7 +116,7 @@ class Slam:
         """
         check_truth(config, self._true_motion)
         self.config = config
-        self._keyframes.limit = config.keyframes.on_device
+        self._mapper.use(config)
         self._tracker = make_tracker(self._rasterizer, config.tracking, config.threads, self.backend.device)
 
     def load(self, gaussians: Gaussians, T_world_cam: Matrix) -> None:
@@ -139,8 +138,8 @@ class Slam:
     def state(self) -> SlamState:
         """All that the frames to come depend on; ``restore`` goes on from it, bit for bit."""
         return SlamState(
-            self.config, self.camera, self.map.arrays(), tuple(self._keyframes), self._motion.state(),
-            dict(self._rng.bit_generator.state), self._scene_radius, self._num_frames, self._last_stamp_ns,
+            self.config, self.camera, self.map.arrays(), tuple(self._mapper.keyframes), self._motion.state(),
+            dict(self._mapper.rng.bit_generator.state), self._mapper.scene_radius, self._num_frames, self._last_stamp_ns,
         )  # fmt: skip
 
     def restore(self, state: SlamState) -> None:
@@ -150,12 +149,9 @@ class Slam:
             ValueError: the state is not one of this configuration's.
         """
         self.reset()
-        self.map.restore(state.map)
+        self._mapper.restore(state.map, state.keyframes, state.rng, state.scene_radius)
         self._motion.restore(state.motion)
-        self._rng.bit_generator.state = state.rng
-        for keyframe in state.keyframes:
-            self._keyframes.append(keyframe)
-        self.camera, self._scene_radius = state.camera, state.scene_radius
+        self.camera = state.camera
         self._num_frames, self._last_stamp_ns = state.num_frames, state.last_stamp_ns
 
     def rest(self) -> None:
@@ -175,19 +171,17 @@ class Slam:
         with torch.no_grad():
             return self._rasterizer.render(self.map.gaussians.detached(), self.camera, T_cam_world).images()
 
-    def finish(self, limit_s: float = math.inf) -> int:
+    def finish(self, limit_s: float = math.inf, stop: Callable[[], bool] = lambda: False) -> int:
         """Fit the map to all keyframes once more, after the last frame (``mapping.final_passes``; 0 leaves all as it is).
 
         Args:
             limit_s: seconds it may take.
+            stop: asked before each step; where it says so, this was the last.
 
         Returns:
             How many steps it took.
         """
-        if not self.config.mapping.enabled:
-            return 0
-        keyframes = self._keyframes.window(self._keyframes)
-        return refit(self.map, keyframes, self._rasterizer, self.config.mapping, self._rng, limit_s)
+        return self._mapper.finish(limit_s, stop)
 
     def snapshot(self) -> MapSnapshot:
         """A copy of the map."""
@@ -203,12 +197,17 @@ class Slam:
             )
         self.camera = frame.camera
 
-    def _initialize(self, index: int, frame: RgbdFrame, kept: View, view: View, clock: _Stopwatch) -> FrameResult:
-        if reason := self._why_not_to_start(index, view):
+    def _initialize(self, index: int, frame: RgbdFrame, kept: View, view: View, clock: Stopwatch) -> FrameResult:
+        reason = self._why_not_to_start(index, view)
+        if not reason:
+            self._mapper = self._new_mapper()
+            self._mapper.add(0, kept, view, np.eye(4), 0.0, clock)
+            if self.num_gaussians == 0:
+                reason = 'no reading lies where Gaussians would be added (densification.scale)'
+        if reason:
             reason = f'the map cannot start: {reason}'
             return self._result(index, frame, Status.LOST, None, False, clock, reason, 0.0, 0.0)
         self._motion.observe(frame.stamp_ns, np.eye(4))
-        self._map(0, kept, view, np.eye(4), 0.0, clock)
         return self._result(index, frame, Status.INITIALIZED, np.eye(4), True, clock, '', 1.0, 1.0)
 
     def _why_not_to_start(self, index: int, view: View) -> str:
@@ -218,36 +217,8 @@ class Slam:
             return 'this frame is held out of it (mapping.hold_out)'
         return '' if view.valid.any() else 'no pixel has a usable depth reading'
 
-    def _map(
-        self, index: int, kept: View, view: View, T_cam_world: Matrix, sure_fraction: float, clock: _Stopwatch
-    ) -> bool:
-        """Densify, choose a window, refine; keep the view that was fitted, on the host, if it is due. Whether it was."""
-        config = self.config
-        if not config.mapping.enabled or config.mapping.is_held_out(index):
-            return False
-        index -= config.mapping.num_held_out(index)  # what is held out leaves the rhythm of the others as it is
-        self._scene_radius = self._scene_radius or float(kept.depth.max()) / config.mapping.scene_radius_ratio
-        current = _posed(view, T_cam_world)
-        keyframe = _posed(kept.narrowed(config.mapping.scale, config.mapping.max_width), T_cam_world)
-        to_fit = current if keyframe.view is kept else keyframe.to(self.backend.device)
-        mapped, every = divmod(index, config.mapping.every)
-        if every == 0:
-            if mapped % config.densification.every == 0 or sure_fraction < config.densification.when_unsure:
-                self.map.append(
-                    densify(self.map.gaussians, current.view, current.T_cam_world, self._rasterizer, config.densification)
-                )
-                clock.lap('densify')
-            chosen = select_keyframes(_posed(kept, T_cam_world), self._keyframes, config.keyframes, self._rng)
-            window = self._keyframes.window([*chosen, to_fit])
-            clock.lap('keyframes')
-            more = config.mapping.first_iterations if index == 0 else 0
-            refine(self.map, window, self._rasterizer, config, self._scene_radius, self._rng, more)
-            clock.lap('map')
-        is_keyframe = is_due(index, config.keyframes, self._all_frames)
-        if is_keyframe:
-            without_cached = PosedView(replace(keyframe.view), keyframe.T_cam_world)
-            self._keyframes.append(without_cached, to_fit)
-        return is_keyframe
+    def _new_mapper(self) -> Mapper:
+        return Mapper(self.config, self._rasterizer, self.backend.device, self._all_frames)
 
     def _motion_model(self) -> MotionModel:
         if self.config.tracking.method == 'truth':
@@ -256,7 +227,7 @@ class Slam:
 
     def _result(
         self, index: int, frame: RgbdFrame, status: Status, T_world_cam: Matrix | None, is_keyframe: bool,
-        clock: _Stopwatch, reason: str, sure_fraction: float, inlier_fraction: float,
+        clock: Stopwatch, reason: str, sure_fraction: float, inlier_fraction: float,
     ) -> FrameResult:  # fmt: skip
         return FrameResult(
             index, frame.stamp_ns, status, T_world_cam, is_keyframe, self.num_gaussians,
@@ -275,25 +246,3 @@ def check_truth(config: SlamConfig, true_motion: MotionPrior | None) -> None:
             "tracking.method = truth: there are no true poses here; only 'splatam run' on a recording that has them takes it. "
             'Choose render_and_compare or align'
         )
-
-
-def _posed(view: View, T_cam_world: Matrix) -> PosedView:
-    return PosedView(view, pose_tensor(T_cam_world, view.depth.device))
-
-
-@dataclass(slots=True)
-class _Stopwatch:
-    device: torch.device
-    started: float = field(default_factory=time.perf_counter)
-    lapped: float = field(default_factory=time.perf_counter)
-    laps: dict[str, float] = field(default_factory=dict)
-
-    def lap(self, stage: str) -> None:
-        finish(self.device)
-        now = time.perf_counter()
-        self.laps[stage] = 1e3 * (now - self.lapped)
-        self.lapped = now
-
-    def timings(self) -> StageTimings:
-        finish(self.device)
-        return StageTimings(**self.laps, total=1e3 * (time.perf_counter() - self.started))

@@ -62,12 +62,12 @@ class View:
 
     def narrowed(self, scale: float, max_width: int) -> View:
         """The same view at a scale, or at the one that makes it ``max_width`` pixels wide, if that is less; 0 = any width."""
-        return self.scaled(min(scale, max_width / self.camera.width) if max_width else scale)
+        return self.scaled(narrowing(self.camera.width, scale, max_width))
 
-    def points(self, chosen: Tensor) -> Tensor:
-        """[K, 3] camera coordinates of the pixels where ``chosen`` [H, W] is true, row by row."""
-        v, u = torch.nonzero(chosen, as_tuple=True)
-        return unproject(self.camera, u, v, self.depth[v, u])
+
+def narrowing(width: int, scale: float, max_width: int) -> float:
+    """A scale, or the one that makes ``width`` pixels ``max_width``, if that is less; 0 = any width."""
+    return min(scale, max_width / width) if max_width else scale
 
 
 def unproject(camera: PinholeCamera, u: Tensor, v: Tensor, z: Tensor) -> Tensor:

@@ -57,7 +57,7 @@ def run(for_ros: Sequence[str], stop: StopRequest) -> int:
                 executor.spin_once(timeout_sec=STEP_S)
             executor.remove_node(node)
         finally:
-            is_fine = node.close()
+            is_fine = node.close(lambda: stop.requested)
     return EXIT_OK if is_fine else EXIT_FAILED
 
 

@@ -206,24 +206,25 @@ class SplatamNode(Node):
     def _use_config(self, config: SlamConfig) -> None:
         self._worker.call(lambda slam: slam.configure(config))
 
-    def close(self) -> bool:
-        """Take no more messages, finish what waits, save, destroy. Whether all went well."""
+    def close(self, is_hurried: Callable[[], bool] = lambda: True) -> bool:
+        """Take no more messages, finish what waits, save, destroy. Whether all went well.
+
+        Args:
+            is_hurried: whether somebody waits for the end, and may kill the process.
+        """
         for item in self._inputs:
             item.close()
         if self._keeps_all:
             self._supply(self._intake.flush())
         is_fine = self._attempt('SLAM', lambda: self._worker.stop(drain=self._keeps_all))
         self._report_drops()
-        is_fine &= self._attempt('saving', self._save)
+        if self.options.folder is not None and self.options.save_on_shutdown:
+            if self._worker.error is None:
+                is_fine &= self._attempt('fitting the map once more', lambda: self._session.fit(self._slam, is_hurried))
+            is_fine &= self._attempt('saving', lambda: self._session.finish(self._slam))
+        is_fine &= self._attempt('saving', self._session.close)
         self.destroy_node()
         return is_fine
-
-    def _save(self) -> None:
-        try:
-            if self.options.folder is not None and self.options.save_on_shutdown:
-                self._session.finish(self._slam)
-        finally:
-            self._session.close()
 
     def _attempt(self, what: str, action: Callable[[], object]) -> bool:
         """Do something that must not keep the rest of the shutdown from happening."""

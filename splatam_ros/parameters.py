@@ -37,7 +37,8 @@ NODE_SETTINGS: tuple[Setting, ...] = (
     _setting('overwrite', False, 'Replace the run that is in save_path, if nothing else is there.'),
     _setting('save_on_shutdown', True, 'Save map and metrics at the end; the trajectory is written as it goes anyway.'),
     _setting(
-        'finish_limit', 3.0, 'Longest time for mapping.final_passes before that; launch kills 10 s after its Ctrl-C.', 's', 0.1
+        'finish_limit', 3.0, 'Longest time for mapping.final_passes before saving, when asked to stop: launch kills 10 s after '
+        'its Ctrl-C. A node that ends by itself (exit_on_publisher_end) takes as long as they need.', 's', 0.1
     ),
     _setting('load_path', '', 'Map for ~/load_map, a .ply file or the folder of a run; loaded at the start, too.'),
     _setting('load_pose', '', 'Where the camera is in a loaded map, x y z qx qy qz qw; none = where it began.', 'm'),

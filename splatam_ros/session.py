@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,7 @@ class Session:
         self._outputs = outputs
         self._epoch = 0
         self._lost_since_ns: int | None = None
+        self._finish_s = 0.0
         self._folder: RunFolder | None = None
         if options.folder is not None:
             self._folder = RunFolder.create(options.folder, config, self._description, overwrite=options.overwrite)
@@ -133,20 +135,23 @@ class Session:
                           f'{metrics.num_gaussians} Gaussians in {path}')  # fmt: skip
         return metrics
 
+    def fit(self, slam: Slam, is_hurried: Callable[[], bool]) -> None:
+        """Fit the map once more: within ``finish_limit`` where there is a hurry, else until it is done or there is one."""
+        hurried, begin = is_hurried(), time.monotonic()
+        steps = slam.finish(self.options.finish_limit) if hurried else slam.finish(stop=is_hurried)
+        self._finish_s = time.monotonic() - begin
+        if steps:
+            self._logger.info(f'fitted the map to all keyframes once more: {steps} steps in {self._finish_s:.1f} s')
+
     def finish(self, slam: Slam) -> None:
-        """Fit the map once more, and save it; where no frame ever came leave the folder empty, for the next attempt.
+        """Save the map; where no frame ever came leave the folder empty, for the next attempt.
 
         Raises:
             SplatamError: as ``save``.
         """
         folder = self._folder
         if folder is None or not folder.is_empty or folder.has_previous:
-            begin = time.monotonic()
-            steps = slam.finish(self.options.finish_limit)
-            finish_s = time.monotonic() - begin
-            if steps:
-                self._logger.info(f'fitted the map to all keyframes once more: {steps} steps in {finish_s:.1f} s')
-            self.save(slam, finish_s)
+            self.save(slam, self._finish_s)
             return
         folder.discard()
         self._logger.info(f'no frame came, so nothing is saved in {folder.path}')

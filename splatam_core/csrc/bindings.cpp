@@ -130,7 +130,6 @@ PYBIND11_MODULE(_native, module) {
   py::class_<Engine, std::shared_ptr<Engine>>(module, "Engine")
       .def(py::init([](int threads) { return std::make_shared<Engine>(threads); }), py::arg("threads"))
       .def_property_readonly("instruction_set", &Engine::instruction_set)
-      .def_property_readonly("threads", &Engine::threads)
       .def("forward", &forward)
       .def("backward", &backward)
       .def("fit", &fit);

@@ -24,7 +24,7 @@ std::uint32_t depth_bits(float z) {
   return bits - near;
 }
 
-// Whether any Gaussian within bounds can reach a pixel.
+// Whether any Gaussian within bounds can reach a pixel; where they are not finite, it may.
 bool may_be_seen(const float* bounds, const Camera& camera, const Pose& pose) {
   constexpr float kReach = 3.34f;       // of a Gaussian, in its own deviations: sqrt(2 ln 255), rounded up
   constexpr float kBlurReach = 1.84f;   // px: that of the blur alone
@@ -41,7 +41,7 @@ bool may_be_seen(const float* bounds, const Camera& camera, const Pose& pose) {
   // An edge of the image, and the eye, span a plane; a disc may reach over it.
   const auto inside = [&](float across, float focal, float pixels) {
     const float along = pixels + kBlurReach;
-    return focal * across + along * c[2] + radius * std::sqrt(focal * focal + along * along) + reach >= 0.0f;
+    return !(focal * across + along * c[2] + radius * std::sqrt(focal * focal + along * along) + reach < 0.0f);
   };
   return inside(c[0], camera.fx, camera.cx) && inside(-c[0], camera.fx, float(camera.width - 1) - camera.cx) &&
          inside(c[1], camera.fy, camera.cy) && inside(-c[1], camera.fy, float(camera.height - 1) - camera.cy);

@@ -52,7 +52,6 @@ class Engine : public std::enable_shared_from_this<Engine> {
              const Camera&, const Pose&, const Target&);
 
   const char* instruction_set() const { return kernels_.name; }
-  int threads() const { return pool_.size(); }
 
  private:
   std::shared_ptr<View> borrow_view();

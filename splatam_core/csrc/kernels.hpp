@@ -98,7 +98,7 @@ struct AlignmentSums {
 
 struct AlignmentSettings {
   float gain, bias;                     // of the light: frame = gain * reference + bias
-  float velocity[6];                    // twist a second: how the light's pose changes with its lag
+  float velocity[6];                    // twist a frame: how the light's pose changes with its lag
   float light_scale, depth_scale;       // of the residuals; that of depth is relative
   float max_depth_ratio;                // larger differences are other surfaces
   float inlier_light, inlier_depth;     // what counts as agreeing

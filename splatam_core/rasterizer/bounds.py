@@ -21,8 +21,8 @@ def _by_numpy(means: Tensor, log_scales: Tensor) -> Tensor:
     """A fifth of torch's time on a processor."""
     starts = np.arange(0, len(means), BLOCK)
     places, scales = means.numpy(), log_scales.numpy()
-    least, most = np.minimum.reduceat(places, starts), np.maximum.reduceat(places, starts)
-    return torch.from_numpy(np.concatenate([least, most, np.maximum.reduceat(scales, starts)], axis=1))
+    least, most = np.fmin.reduceat(places, starts), np.fmax.reduceat(places, starts)  # what is not a number bounds nothing
+    return torch.from_numpy(np.concatenate([least, most, np.fmax.reduceat(scales, starts)], axis=1))
 
 
 def _by_torch(means: Tensor, log_scales: Tensor) -> Tensor:

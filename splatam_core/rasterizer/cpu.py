@@ -22,6 +22,7 @@ from splatam_core.rasterizer.base import (
     Target,
     check_isotropic,
 )
+from splatam_core.rasterizer.bounds import BLOCK
 from splatam_core.rasterizer.ewa import Ellipses, project
 
 try:
@@ -31,6 +32,8 @@ except ImportError as error:
         f"the CPU rasterizer's native module cannot be loaded ({error}); build it with 'pip install .' "
         "(needs g++ and Python's headers), or use rasterizer=reference"
     ) from None
+if _native.BLOCK != BLOCK:
+    raise RasterizerError("the CPU rasterizer's native module is of another version: build it anew with 'pip install .'")
 
 
 class CpuRasterizer:

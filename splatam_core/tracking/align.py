@@ -66,7 +66,7 @@ class AlignmentTracker:
         if found.inlier_fraction >= self._config.again_below:
             return found
         again = self._track(frames, view.camera, gaussians, found.T_cam_world_depth, T_cam_world_before)
-        return max(found, again, key=lambda result: result.inlier_fraction)
+        return max(found, again, key=lambda result: (not result.failure, result.inlier_fraction))
 
     def _track(
         self, frames: list[_Picture], camera: PinholeCamera, gaussians: Gaussians, T_cam_world: Matrix,

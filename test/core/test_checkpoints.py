@@ -265,8 +265,11 @@ def test_keyframes_are_written_once_and_removed_with_the_last_checkpoint_that_ha
     writer.save(state, replace(PROGRESS, num_lines=5))
     both = {path: path.stat().st_mtime_ns for path in (tmp_path / 'keyframes').iterdir()}
     assert len(first) == 1 and len(both) == 2 and first.items() <= both.items()
-    writer.save(replace(state, keyframes=()), replace(PROGRESS, num_lines=6))
-    assert not any((tmp_path / 'keyframes').iterdir())
+    resumed = Checkpoints(tmp_path, 2)
+    for lines, left in ((6, 2), (7, 0)):
+        resumed.save(replace(state, keyframes=()), replace(PROGRESS, num_lines=lines))
+        assert len(list((tmp_path / 'keyframes').iterdir())) == left
+        read_checkpoint(checkpoint_paths(tmp_path)[0])
 
 
 def test_only_the_last_ones_are_kept(state: SlamState, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -317,6 +317,25 @@ def test_the_steps_after_the_last_frame_are_counted_and_are_not_of_a_run_that_wa
     monkeypatch.setattr(Slam, 'process', interrupted)
     assert splatam('run', SOURCE, *few, '--out', tmp_path / 'stopped') == 130
     assert 'once more' not in capsys.readouterr().err and metrics(tmp_path / 'stopped')['finish_s'] == 0
+
+
+def test_ctrl_c_while_the_map_is_fitted_once_more_saves_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish, steps = Slam.finish, []
+
+    def interrupted(slam: Slam, *, stop: Callable[[], bool]) -> int:
+        signal.raise_signal(signal.SIGINT)
+        steps.append(finish(slam, stop=stop))
+        return steps[0]
+
+    monkeypatch.setattr(Slam, 'finish', interrupted)
+    few = ['--preset', 'realtime', '--width', WIDTH, '--max-frames', 6]
+    assert splatam('run', SOURCE, *few, '--out', tmp_path / 'run') == 130
+    said = capsys.readouterr().err
+    assert 'stopping where the map is by now' in said and 'stopped while the map was fitted once more' in said
+    assert steps == [0] and metrics(tmp_path / 'run')['frames'] == 6 and (tmp_path / 'run' / 'map.ply').is_file()
+    assert splatam('evaluate', tmp_path / 'run') == 0
 
 
 # --- evaluate ---

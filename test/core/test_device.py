@@ -13,10 +13,10 @@ import pytest
 import torch
 from second_device import DEVICE, DeviceRasterizer, DeviceTensor, SecondDevice
 
-from splatam_core import densification, slam
+from splatam_core import densification, mapper, slam, stopwatch
 from splatam_core.backend import Backend
 from splatam_core.camera import PinholeCamera
-from splatam_core.config import SlamConfig, TrackingConfig, load_config
+from splatam_core.config import KeyframeConfig, SlamConfig, TrackingConfig, load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
 from splatam_core.evaluation.images import ImageScores, OriginalScores, ViewScorer
 from splatam_core.export import centres
@@ -49,7 +49,7 @@ def _on_device(monkeypatch: pytest.MonkeyPatch) -> Iterator[SecondDevice]:
     with monkeypatch.context() as patch, SecondDevice() as device:
         patch.setattr(slam, 'choose_backend', lambda config: Backend(DEVICE, 'cpu'))
         patch.setattr(slam, 'make_rasterizer', lambda name, threads: DeviceRasterizer())
-        patch.setattr(slam, 'finish', lambda device: None)
+        patch.setattr(stopwatch, 'finish', lambda device: None)
         yield device
 
 
@@ -102,7 +102,7 @@ def test_keyframes_are_in_the_hosts_memory_and_a_bounded_number_on_the_device() 
     """Those used last stay there, and are brought there once."""
     camera = PinholeCamera(4, 3, 4.0, 4.0, 1.5, 1.0)
     with SecondDevice() as device:
-        store = KeyframeStore(DEVICE, limit=2)
+        store = KeyframeStore(DEVICE, KeyframeConfig(on_device=2))
         kept = [
             PosedView(View(camera, torch.zeros(3, 4, 3, dtype=torch.uint8), torch.full((3, 4), float(k))), torch.eye(4))
             for k in range(4)
@@ -135,8 +135,8 @@ def test_a_frame_goes_to_the_device_once(room: Room, monkeypatch: pytest.MonkeyP
         slam = Slam(_config('realtime'))
         for index in range(6):
             slam.process(sequence[index])
+        assert len(slam.state().keyframes) == 3
     assert sorted(view.camera.width for view in brought) == [WIDTH * 3 // 4] * 6 + [WIDTH] * 6
-    assert len(slam._keyframes) == 3
 
 
 def test_no_step_of_tracking_waits_for_the_device(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -203,7 +203,7 @@ def test_refining_a_map_happens_on_the_device(room: Room, monkeypatch: pytest.Mo
     ('module', 'name', 'wrong'),
     [
         (densification, 'box_sums', lambda image, side: torch.zeros(image.shape)),
-        (slam, 'pose_tensor', lambda T, device: torch.from_numpy(T).float()),
+        (mapper, 'pose_tensor', lambda T, device: torch.from_numpy(T).float()),
     ],
 )
 def test_what_forgets_the_device_is_noticed(

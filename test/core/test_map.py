@@ -13,11 +13,11 @@ from splatam_core.camera import PinholeCamera
 from splatam_core.config import DensificationConfig, KeyframeConfig, MappingConfig, load_config
 from splatam_core.densification import densify, new_gaussians, unexplained
 from splatam_core.gaussian_map import PARAMETERS, GaussianMap
-from splatam_core.keyframes import PosedView, draw, is_due, overlaps, select_keyframes
+from splatam_core.keyframes import KeyframeStore, PosedView, draw, is_due, overlaps, select_keyframes
 from splatam_core.mapping import FINAL_FIRST, FINAL_LAST, FINAL_MEANS, prunable, refine, refit
 from splatam_core.rasterizer import Gaussians, Moments, Rates, Render, Target, joined, make_rasterizer
 from splatam_core.rasterizer.cpu import CpuRasterizer
-from splatam_core.view import View
+from splatam_core.view import View, unproject
 
 CAMERA = PinholeCamera(32, 24, 30.0, 30.0, 15.5, 11.5)
 EYE = torch.eye(4)
@@ -200,7 +200,13 @@ def test_views_are_made_smaller_by_scale_and_width(scale: float, max_width: int,
 
 def test_finishing_ends_when_its_time_is_up_and_nothing_is_asked_of_it_by_default() -> None:
     keyframe, rng = PosedView(_view(), EYE), np.random.default_rng(0)
-    assert refit(_map(_view()), [keyframe], _Listed(), _finishing(100_000_000), rng, limit_s=0.2) < 100_000_000
+    in_time = _Listed()
+    assert refit(_map(_view()), [keyframe], in_time, _finishing(100_000_000), rng, limit_s=0.2) < 100_000_000
+    first, last = in_time.asked[0][0].rgb, in_time.asked[-1][0].rgb
+    assert last < 0.1 * first  # it faded, from 5 to about 0.2 of the usual: a step takes a small part of the time
+    assert refit(_map(_view()), [keyframe], _Listed(), _finishing(5), rng, limit_s=0.0) == 0
+    stopped = _Listed()
+    assert refit(_map(_view()), [keyframe], stopped, _finishing(5), rng, stop=lambda: len(stopped.asked) == 3) == 3
     assert refit(_map(_view()), [keyframe], rasterizer := _Listed(), _finishing(0), rng) == 0 and not rasterizer.asked
     assert refit(_map(_view()), [], _Listed(), _finishing(5), rng) == 0
 
@@ -301,12 +307,32 @@ def test_snapshot_stays_as_it_was() -> None:
 
 def test_overlap_is_the_share_seen_inside_the_margin() -> None:
     view = _view()
-    points = view.points(view.valid)
+    v, u = torch.nonzero(view.valid, as_tuple=True)
+    points = unproject(view.camera, u, v, view.depth[v, u])
     here, behind = PosedView(view, EYE), PosedView(view, _at(0.0, math.pi))
     assert overlaps(points, view.camera, [here, behind], 0) == pytest.approx([1.0, 0.0], abs=0.1)  # the outermost are on the rim
     assert overlaps(points, view.camera, [here], 8) == pytest.approx([15 * 7 / 768], abs=0.01)
     assert overlaps(points[:0], view.camera, [here], 0) == [0.0]
     assert overlaps(points, view.camera, [], 0) == []
+
+
+def test_beyond_the_budget_the_keyframe_goes_that_its_neighbours_replace() -> None:
+    """A camera that rests fills no memory, and what it saw on its way stays; the last frame is always there."""
+    store = KeyframeStore(torch.device('cpu'), KeyframeConfig(budget=6))
+    way = [0.0, 0.5, 1.0, 1.5, 2.0]
+    for x in [*way, *[2.0] * 50]:
+        store.append(PosedView(_view(), _at(x)))
+    last = PosedView(_view(), _at(2.0, 0.1))
+    store.append(last)
+    assert [round(-float(keyframe.T_cam_world[0, 3]), 3) for keyframe in store][:5] == way and len(store) == 6
+    assert store[-1] is last
+    store.append(PosedView(_view(), _at(2.0, 1.2)))  # turned away: more than half a metre would move it
+    assert [keyframe is last for keyframe in store].count(True) == 1 and len(store) == 6
+    for budget, expected in ((1, [3.0]), (2, [0.0, 3.0])):
+        store = KeyframeStore(torch.device('cpu'), KeyframeConfig(budget=budget))
+        for x in (0.0, 1.0, 2.0, 3.0):
+            store.append(PosedView(_view(), _at(x)))
+        assert [-float(keyframe.T_cam_world[0, 3]) for keyframe in store] == expected
 
 
 def test_the_current_view_gets_its_share_of_the_steps() -> None:
@@ -341,6 +367,28 @@ def test_gaussians_out_of_view_are_skipped_without_a_trace() -> None:
         pose = _at(0.5 * k - 3, 0.5 * k)
         first, second = (rasterizer.render(gaussians, CAMERA, pose) for gaussians in (bounded, unbounded))
         assert torch.equal(first.rgb, second.rgb) and torch.equal(first.silhouette, second.silhouette)
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf])
+def test_one_that_is_not_finite_hides_none_of_its_block(value: float) -> None:
+    gaussian_map, broken = _map(_view()), _map(_view()).gaussians.detached()
+    broken.means[5] = value
+    gaussian_map.append(broken)
+    bounded = gaussian_map.gaussians
+    assert bounded.bounds is not None
+    first, second = (make_rasterizer('cpu', 1).render(g, CAMERA, EYE) for g in (bounded, replace(bounded, bounds=None)))
+    assert torch.equal(first.rgb, second.rgb) and first.silhouette.mean() > 0.9
+
+
+def test_fused_pruning_waits_until_a_share_of_the_map_is_to_go() -> None:
+    for faint, left in ((4, 768), (40, 728)):
+        gaussian_map = _map(_view())
+        gaussian_map.logit_opacities[:faint] = -9.0
+        config = load_config(
+            overrides={'mapping.iterations': 1, 'mapping.optimizer': 'fused', 'mapping.prune_share': 0.02}
+        )
+        refine(gaussian_map, [PosedView(_view(), EYE)], make_rasterizer('cpu', 1), config, 10.0, np.random.default_rng(0))
+        assert len(gaussian_map) == left
 
 
 @pytest.mark.parametrize(('old', 'new'), [(0, 5), (1024, 0), (1024, 3000), (1500, 10), (2500, 3000)])

@@ -16,18 +16,23 @@ from splatam_core.types import Status, Trajectory
 
 
 @pytest.mark.parametrize(
-    ('name', 'rmse_m'),
+    ('preset', 'width', 'name', 'rmse_m'),
     [
         # At 160 pixels width one pixel is 1.5 cm at 2 m; the truth itself is good to 0.5 cm.
-        ('7scenes_redkitchen', 0.01),
+        ('quick', 160, '7scenes_redkitchen', 0.01),
         # Turning up to 60 degrees a second with motion blur: half as much again.
-        ('tum_fr1_rpy', 0.025),
+        ('quick', 160, 'tum_fr1_rpy', 0.025),
+        ('realtime', 320, '7scenes_redkitchen', 0.01),
+        ('realtime', 320, 'tum_fr1_rpy', 0.025),
+        ('realtime', 640, 'tum_fr1_rpy', 0.025),  # renders for tracking at half size
     ],
 )
-def test_tracks_the_first_frames(name: str, rmse_m: float, recording: Callable[[str], Path]) -> None:
-    """Every frame, with preset quick."""
-    sequence = open_sequence(str(recording(name)), width=160, max_frames=40)
-    slam = Slam(load_config('quick', ['threads=1']))
+def test_tracks_the_first_frames(
+    preset: str, width: int, name: str, rmse_m: float, recording: Callable[[str], Path]
+) -> None:
+    """Every frame."""
+    sequence = open_sequence(str(recording(name)), width=width, max_frames=40)
+    slam = Slam(load_config(preset, ['threads=1']))
     results = [slam.process(sequence[i]) for i in range(len(sequence))]
     assert [result.status for result in results[1:]] == [Status.TRACKED] * 39
     stamps = np.array([result.stamp_ns for result in results], dtype=np.int64)

@@ -311,13 +311,15 @@ def test_finishing_leaves_a_map_alone_that_is_only_looked_at(room: tuple[list[Rg
     assert slam.finish() == 0 and np.array_equal(slam.snapshot().means, means)
 
 
-def test_keyframes_keep_no_more_than_the_images(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+@pytest.mark.parametrize('preset', ['realtime', 'quick'])
+def test_keyframes_keep_no_more_than_the_images(preset: str, room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
     """Seven bytes a pixel; what a view works out on the way is not carried along for good."""
     frames, _ = room
-    slam = Slam(load_config('realtime', ['threads=1']))
+    slam = Slam(load_config(preset, ['threads=1', 'keyframes.every=2']))
     for frame in frames:
         slam.process(frame)
-    for keyframe in slam._keyframes:
+    assert len(slam.state().keyframes) > 2
+    for keyframe in slam.state().keyframes:
         assert set(vars(keyframe.view)) == {'camera', 'rgb8', 'depth'}
 
 
@@ -339,6 +341,59 @@ def test_views_are_fitted_and_kept_at_the_size_of_mapping(
     cameras = [keyframe.view.camera for keyframe in slam.state().keyframes]
     assert cameras == [room[0][0].camera.resized(60, 45)] * 3 and slam.camera == room[0][0].camera
     assert len(fitted) == slam.config.mapping.iterations * (1 + 2 + 3)  # of every second frame, with its keyframes
+
+
+@pytest.mark.parametrize('preset', ['quick', 'realtime'])
+def test_a_scene_that_opens_up_is_mapped(preset: str, room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """What is far is not pruned for being wide beside the near wall that the camera faced first."""
+    left, right = np.zeros_like(room[0][0].depth_m), np.zeros_like(room[0][0].depth_m)
+    left[:, : WIDTH // 2], right[:, WIDTH // 2 :] = 0.3, 20.0
+    slam = Slam(load_config(preset, ['tracking.method=none', 'mapping.every=1', 'densification.every=1']))
+    slam.process(dataclasses.replace(room[0][0], depth_m=left))
+    near = slam.num_gaussians
+    slam.process(dataclasses.replace(room[0][1], depth_m=right))
+    assert (slam.map.means[:, 2] > 10).sum() > 0.8 * near
+
+
+def test_a_reading_between_the_pixels_of_the_grid_starts_no_map(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """Lost, and no keyframe of it; the next frame starts the map."""
+    frames, _ = room
+    slam = _slam('densification.scale=0.1', 'keyframes.every=1')
+    lonely = np.zeros_like(frames[0].depth_m)
+    lonely[0, 0] = 1.0
+    result = slam.process(dataclasses.replace(frames[0], depth_m=lonely))
+    assert result.status is Status.LOST and 'densification.scale' in result.reason and not slam.state().keyframes
+    assert slam.process(frames[1]).status is Status.INITIALIZED and len(slam.state().keyframes) == 1
+
+
+def test_few_gaussians_are_added_between_the_frames_whose_turn_it_is(
+    room: tuple[list[RgbdFrame], list[np.ndarray]]
+) -> None:
+    """On every third frame, and where less of the view is sure than asked for: here never, and always."""
+    frames, _ = room
+    for when_unsure, grows in ((0.0, [False, False, True, False, False]), (1.0, [True] * 5)):
+        changes = ['mapping.every=1', 'mapping.prune_every=0', 'densification.every=3']
+        slam = _slam(*changes, f'densification.when_unsure={when_unsure}')
+        sizes = [slam.process(frame).num_gaussians for frame in frames[:6]]
+        assert [b > a for a, b in zip(sizes, sizes[1:], strict=False)] == grows
+
+
+def test_the_first_frame_has_steps_of_its_own(
+    room: tuple[list[RgbdFrame], list[np.ndarray]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counts: list[int] = []
+    fit = CpuRasterizer.fit
+
+    def counted(self: CpuRasterizer, *arguments: object) -> float:
+        counts[-1] += 1
+        return fit(self, *arguments)
+
+    monkeypatch.setattr(CpuRasterizer, 'fit', counted)
+    slam = Slam(load_config('realtime', ['threads=1', 'mapping.first_iterations=4', 'mapping.iterations=2']))
+    for frame in room[0][:3]:
+        counts.append(0)
+        slam.process(frame)
+    assert counts == [6, 2, 2]
 
 
 def test_tracking_never_returns_a_pose_worse_than_its_guess(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:

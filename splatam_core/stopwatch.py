@@ -1,0 +1,33 @@
+"""Where a frame's time goes."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import torch
+
+from splatam_core.backend import finish
+from splatam_core.types import StageTimings
+
+
+@dataclass(slots=True)
+class Stopwatch:
+    """Wall time of the stages of one frame; waits for the device at the end of each."""
+
+    device: torch.device
+    started: float = field(default_factory=time.perf_counter)
+    lapped: float = field(default_factory=time.perf_counter)
+    laps: dict[str, float] = field(default_factory=dict)
+
+    def lap(self, stage: str) -> None:
+        """A stage has ended; the next begins."""
+        finish(self.device)
+        now = time.perf_counter()
+        self.laps[stage] = 1e3 * (now - self.lapped)
+        self.lapped = now
+
+    def timings(self) -> StageTimings:
+        """All so far."""
+        finish(self.device)
+        return StageTimings(**self.laps, total=1e3 * (time.perf_counter() - self.started))
