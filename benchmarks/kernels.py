@@ -22,10 +22,15 @@ from dataclasses import dataclass, replace
 import torch
 from header import print_header, timed_ms
 
+from splatam_core import mapping
 from splatam_core.camera import PinholeCamera
-from splatam_core.rasterizer import Gaussians, Rasterizer, Render, make_rasterizer
+from splatam_core.config import load_config
+from splatam_core.gaussian_map import GaussianMap
+from splatam_core.rasterizer import Gaussians, Rasterizer, Render, Target, make_rasterizer
 from splatam_core.rasterizer.base import BLUR_PX2, MIN_ALPHA
 from splatam_core.rasterizer.cpu import CpuRasterizer
+from splatam_core.tracking import make_tracker
+from splatam_core.view import View
 
 SIZES = ((320, 240), (640, 480))
 TILE = 8
@@ -88,6 +93,30 @@ class Work:
     def roofline_ms(self, rates: Work) -> float:
         """The least time at given rates a second."""
         return 1e3 * max(self.operations / rates.operations, self.moved / rates.moved)
+
+
+def wall_view(cam: PinholeCamera) -> View:
+    """The wall as a frame."""
+    g = wavy_wall(cam)
+    rgb8 = (255 * g.rgb).byte().view(cam.height, cam.width, 3)
+    return View(cam, rgb8, g.means[:, 2].reshape(cam.height, cam.width).contiguous())
+
+
+def realtime_row(name: str, rasterizer: Rasterizer, cam: PinholeCamera, runs: int, threads: int) -> None:
+    """One step of fused fitting, and one frame of alignment: what preset `realtime` does, on its settings, to this wall."""
+    config, wall, view = load_config('realtime'), GaussianMap(), wall_view(cam)
+    wall.append(wavy_wall(cam))
+    pose = torch.eye(4)
+    pose[0, 3] = 0.003
+    target = Target(cam, view.rgb8, view.depth, pose, config.mapping.color_weight, config.mapping.depth_weight)
+    tracker = make_tracker(rasterizer, config.tracking, threads)
+    still = wavy_wall(cam)
+    times = [
+        timed_ms(lambda: tracker.track(view, still, pose.double().numpy()), runs),
+        timed_ms(lambda: rasterizer.fit(wall.gaussians, wall.moments, mapping.rates(config.mapping), target), runs),
+    ]
+    cells = (f'{statistics.median(ms):.1f} ({min(ms):.1f}-{max(ms):.1f})' for ms in times)
+    print(f'| {name} | {cam.width}x{cam.height} | ' + ' | '.join(cells) + ' |', flush=True)
 
 
 def touched_tiles(gaussians: Gaussians, cam: PinholeCamera) -> int:
@@ -161,6 +190,15 @@ def main() -> None:
     small = camera(64, 48)
     for name in ('cpu', 'reference'):
         row(f'{name}, 1 thread', make_rasterizer(name, 1), small, runs)
+    print('\n| backend | image | alignment of a frame, ms | step of fused fitting, ms |')
+    print('|---|---|---|---|')
+    for size in SIZES:
+        for threads in (1, 2):
+            rasterizer = CpuRasterizer(threads)
+            name = f'cpu, {rasterizer.instruction_set}, {threads} thread{"s"[: threads - 1]}'
+            realtime_row(name, rasterizer, camera(*size), runs, threads)
+    for name in ('cpu', 'reference'):
+        realtime_row(f'{name}, 1 thread', make_rasterizer(name, 1), small, runs, 1)
     print_roofline()
 
 

@@ -31,7 +31,7 @@ class Run:
 
     Attributes:
         latency_ms: of each pose.
-        published: frames counted.
+        published: frames counted: from the first one that was processed on.
         processed: of those, tracked or lost.
         tracked: of those, with a pose.
         cpu_percent: of one core, the node's average.
@@ -47,9 +47,12 @@ class Run:
 
 
 def count(published_ns: dict[int, int], poses: list[Arrival], done: list[Arrival]) -> tuple[list[float], int, int, int]:
-    """Latencies, and frames published, processed and tracked after the first pose."""
-    first_ns = poses[0].received_ns
-    counted = {stamp_ns: at_ns for stamp_ns, at_ns in published_ns.items() if at_ns > first_ns}
+    """Latencies, and frames published, processed and tracked, from the first that was processed on.
+
+    Those before it were published before the node had found the camera.
+    """
+    first_ns = min(item.stamp_ns for item in done)
+    counted = {stamp_ns: at_ns for stamp_ns, at_ns in published_ns.items() if stamp_ns >= first_ns}
     answered = [pose for pose in poses if pose.stamp_ns in counted]
     latency_ms = milliseconds([pose.received_ns - counted[pose.stamp_ns] for pose in answered])
     return latency_ms, len(counted), sum(item.stamp_ns in counted for item in done), len(answered)

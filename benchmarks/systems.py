@@ -3,7 +3,7 @@
     python benchmarks/systems.py SOURCE [--width 320] [--runs 5] [--systems realtime,quick,open3d,opencv] [--plot FILE.png]
 
 Every run is a process of its own, one after the other, the systems taking turns; frames are decoded before the clock
-starts. A system is a preset, ``open3d`` (``pip install open3d``; voxel-block grid, 3.0/512 m voxels, frame to model) or
+starts. Run k of a preset has seed k. A system is a preset, ``open3d`` (``pip install open3d``; voxel-block grid, 3.0/512 m voxels, frame to model) or
 ``opencv`` (frame to frame, no map). ``NAME:60`` runs on the first 60 frames, ``NAME*1`` once instead of --runs times;
 ``NAME[key=value;...]`` changes settings of a preset.
 """
@@ -51,18 +51,22 @@ class Outcome:
     psnr_db: float | None
     num_gaussians: int | None
     peak_rss_mb: float | None
-    median_stages_ms: dict[str, float]
+    mean_stages_ms: dict[str, float]
 
 
-def run_ours(frames: Sequence[RgbdFrame], preset: str, overrides: list[str]) -> tuple[Poses, float, Slam, list[StageTimings]]:
-    """A preset, frame by frame."""
+def run_ours(frames: Sequence[RgbdFrame], preset: str, overrides: list[str]) -> tuple[Poses, float, Slam, dict[str, float]]:
+    """A preset, frame by frame. Also the mean of a frame's stages, and its share of ``finish``."""
     config = load_config(preset, overrides)
     apply_threads(config)
     slam = Slam(config)
     begin = time.perf_counter()
     results = [slam.process(frame) for frame in frames]
+    processed = time.perf_counter()
     slam.finish()
-    return [result.T_world_cam for result in results], time.perf_counter() - begin, slam, [r.timings for r in results]
+    end = time.perf_counter()
+    stages_ms = {name: statistics.mean(getattr(r.timings, name) for r in results) for name in StageTimings.__slots__}
+    stages_ms['finish'] = 1e3 * (end - processed) / len(frames)
+    return [result.T_world_cam for result in results], end - begin, slam, stages_ms
 
 
 def run_open3d(frames: Sequence[RgbdFrame]) -> tuple[Poses, float]:
@@ -110,17 +114,17 @@ def run_opencv(frames: Sequence[RgbdFrame]) -> tuple[Poses, float]:
     return poses, time.perf_counter() - begin
 
 
-def run_one(system: SimpleNamespace, source: str, width: int) -> Outcome:
+def run_one(system: SimpleNamespace, source: str, width: int, seed: int) -> Outcome:
     """One system, in this process."""
     sequence = open_sequence(source, width=width, max_frames=system.frames)
     frames = [sequence[index] for index in range(len(sequence))]
-    slam, stages = None, []
+    slam, stages_ms = None, {}
     if system.name == 'open3d':
         poses, seconds = run_open3d(frames)
     elif system.name == 'opencv':
         poses, seconds = run_opencv(frames)
     else:
-        poses, seconds, slam, stages = run_ours(frames, system.name, system.overrides)
+        poses, seconds, slam, stages_ms = run_ours(frames, system.name, [f'seed={seed}', *system.overrides])
     peak = environment.peak_rss_mb()
     tracked = [(frame, pose) for frame, pose in zip(frames, poses) if pose is not None]
     estimate = Trajectory(np.array([f.stamp_ns for f, _ in tracked]), np.array([pose for _, pose in tracked]))
@@ -131,8 +135,7 @@ def run_one(system: SimpleNamespace, source: str, width: int) -> Outcome:
         psnr_db = mean_scores(scorer.score(*pair) for pair in tracked[::SCORED_EVERY]).psnr_db
     return Outcome(
         len(frames), len(tracked), seconds, None if truth is None else 100 * trajectory_error(estimate, truth).rmse_m,
-        psnr_db, slam and slam.num_gaussians, peak,
-        {name: statistics.median(getattr(s, name) for s in stages) for name in StageTimings.__slots__} if stages else {},
+        psnr_db, slam and slam.num_gaussians, peak, stages_ms,
     )  # fmt: skip
 
 
@@ -146,28 +149,36 @@ def parsed(text: str, runs: int) -> SimpleNamespace:
     return SimpleNamespace(text=text, name=match['name'], overrides=overrides, frames=frames, runs=int(match['runs'] or runs))
 
 
-def in_a_process(system: SimpleNamespace, args: argparse.Namespace) -> Outcome:
+def in_a_process(system: SimpleNamespace, args: argparse.Namespace, seed: int) -> Outcome:
     """The same, in a fresh process: memory and threads of one run are nothing to the next."""
     command = [sys.executable, __file__, args.source, '--width', str(args.width), '--systems', system.text, '--one']
+    command += ['--seed', str(seed)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     return Outcome(**json.loads(done.stdout.splitlines()[-1]))
 
 
-def row(system: SimpleNamespace, outcomes: list[Outcome], fastest_peer: float | None) -> str:
-    """Medians and spread."""
-    fps = sorted(o.frames / o.seconds for o in outcomes)
+def row(system: SimpleNamespace, outcomes: list[Outcome], open3d_fps: float | None) -> str:
+    """Medians and spread; of the frames tracked the least."""
+    fps = [o.frames / o.seconds for o in outcomes]
 
-    def median(name: str, form: str) -> str:
-        known = [getattr(o, name) for o in outcomes if getattr(o, name) is not None]
-        return form.format(statistics.median(known)) if known else '–'
+    def known(name: str) -> list[float]:
+        return [getattr(o, name) for o in outcomes if getattr(o, name) is not None]
 
-    ratio = '' if fastest_peer is None else f'{statistics.median(fps) / fastest_peer:.2f}'
+    ratio = '' if open3d_fps is None else f'{statistics.median(fps) / open3d_fps:.2f}'
     cells = [
-        f'`{system.text}`', str(len(outcomes)), f'{outcomes[0].tracked}/{outcomes[0].frames}',
-        f'{statistics.median(fps):.2f} ({fps[0]:.2f}–{fps[-1]:.2f})', ratio, median('ate_cm', '{:.2f}'),
-        median('psnr_db', '{:.2f}'), median('num_gaussians', '{:.0f}'), median('peak_rss_mb', '{:.0f}'),
+        f'`{system.text}`', str(len(outcomes)), f'{min(o.tracked for o in outcomes)}/{outcomes[0].frames}',
+        spread(fps, 1), ratio, spread(known('ate_cm'), 2), spread(known('psnr_db'), 2),
+        spread(known('num_gaussians'), 0, False), spread(known('peak_rss_mb'), 0, False),
     ]  # fmt: skip
     return '| ' + ' | '.join(cells) + ' |'
+
+
+def spread(values: list[float], digits: int, with_extremes: bool = True) -> str:
+    """The median, and the least and the most where they differ."""
+    if not values:
+        return '–'
+    median, least, most = (f'{of(values):.{digits}f}' for of in (statistics.median, min, max))
+    return f'{median} ({least}–{most})' if with_extremes and least != most else median
 
 
 def plot(path: Path, systems: list[SimpleNamespace], outcomes: dict[str, list[Outcome]], title: str) -> None:
@@ -198,10 +209,11 @@ def main() -> None:
     parser.add_argument('--systems', default='realtime,quick,opencv')
     parser.add_argument('--plot', type=Path)
     parser.add_argument('--one', action='store_true', help=argparse.SUPPRESS)
+    parser.add_argument('--seed', type=int, default=0, help=argparse.SUPPRESS)
     args = parser.parse_args()
     systems = [parsed(text, args.runs) for text in args.systems.split(',')]
     if args.one:
-        print(json.dumps(asdict(run_one(systems[0], args.source, args.width))))
+        print(json.dumps(asdict(run_one(systems[0], args.source, args.width, args.seed))))
         return
     name = f'{Path(args.source).name}, width {args.width}'
     print_header(f'Systems on {name}', args.runs)
@@ -209,17 +221,19 @@ def main() -> None:
     for turn in range(max(system.runs for system in systems)):
         for system in systems:
             if turn < system.runs:
-                outcomes[system.text].append(in_a_process(system, args))
+                outcomes[system.text].append(in_a_process(system, args, turn))
     peer = outcomes.get('open3d')
     peer_fps = statistics.median(o.frames / o.seconds for o in peer) if peer else None
-    print('| system | runs | tracked | fps (min–max) | x Open3D | ATE RMSE cm | PSNR dB | Gaussians | peak MB |')
+    print('Medians (least–most).\n')
+    print('| system | runs | tracked | fps | x Open3D | ATE RMSE cm | PSNR dB | Gaussians | peak MB |')
     print('|' + '---|' * 9)
     for system in systems:
         print(row(system, outcomes[system.text], peer_fps))
     for system in systems:
-        stages = outcomes[system.text][0].median_stages_ms
-        if stages:
-            print(f'\n`{system.text}`, median ms of a frame: ' + ', '.join(f'{k} {v:.1f}' for k, v in stages.items()) + '.')
+        runs = [outcome.mean_stages_ms for outcome in outcomes[system.text]]
+        if runs[0]:
+            stages = (f'{name} {statistics.median(run[name] for run in runs):.1f}' for name in runs[0])
+            print(f'\n`{system.text}`, mean ms of a frame: ' + ', '.join(stages) + '.')
     print(f'\nPSNR over every {SCORED_EVERY}th frame, final map, estimated poses, pixels with depth.')
     if args.plot:
         plot(args.plot, systems, outcomes, name)
