@@ -125,6 +125,11 @@ class TrackingConfig:
         0.0, 'Of alignment: where a smaller share of the pixels agrees, render and align once more from there; 0 = never.',
         '', 0.0, 1.0,
     )  # fmt: skip
+    features: bool = _setting(
+        True,
+        "Of alignment: where that does not help, start from features (ORB, PnP) that the frame shares with the map as seen from "
+        "the last pose.",
+    )
     lag: bool = _setting(True, 'Of alignment: take up that colour and depth of a frame were taken at different times.')
     rotation_rate: float = _setting(4e-4, 'Adam step of the unit quaternion.', '', 0.0)
     translation_rate: float = _setting(2e-3, 'Adam step of the translation.', 'm', 0.0)

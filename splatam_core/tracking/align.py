@@ -30,6 +30,7 @@ from splatam_core.config import TrackingConfig
 from splatam_core.filters import brightness, is_on_host, luminance
 from splatam_core.rasterizer import Gaussians, Rasterizer, Render
 from splatam_core.tracking.base import TrackingResult, failure
+from splatam_core.tracking.features import pose_by_features
 from splatam_core.tracking.torch_aligner import TorchAligner
 from splatam_core.view import View
 
@@ -62,11 +63,23 @@ class AlignmentTracker:
     ) -> TrackingResult:
         """See ``Tracker.track``."""
         frames = self._levels(_frame(view))
-        found = self._track(frames, view.camera, gaussians, T_cam_world, T_cam_world_before)
-        if found.inlier_fraction >= self._config.again_below:
+
+        def align_from(start: Matrix) -> TrackingResult:
+            found = self._track(frames, view.camera, gaussians, start, T_cam_world_before)
+            if self._is_good(found):
+                return found
+            again = self._track(frames, view.camera, gaussians, found.T_cam_world_depth, T_cam_world_before)
+            return max(found, again, key=_rank)
+
+        found = align_from(T_cam_world)
+        if self._is_good(found) or not self._config.features:
             return found
-        again = self._track(frames, view.camera, gaussians, found.T_cam_world_depth, T_cam_world_before)
-        return max(found, again, key=lambda result: (not result.failure, result.inlier_fraction))
+        last = T_cam_world if T_cam_world_before is None else T_cam_world_before
+        motion = pose_by_features(self._render(gaussians, view.camera, last), view)
+        return found if motion is None else max(found, align_from(motion @ last), key=_rank)
+
+    def _is_good(self, result: TrackingResult) -> bool:
+        return result.inlier_fraction >= self._config.again_below
 
     def _track(
         self, frames: list[_Picture], camera: PinholeCamera, gaussians: Gaussians, T_cam_world: Matrix,
@@ -89,13 +102,16 @@ class AlignmentTracker:
         """The map from the first guess, at the resolutions of ``_levels``."""
         least = self._config.half_render_from
         camera = finest if 0 < least <= full.width else full
-        with torch.no_grad():
-            render = self._rasterizer.render(gaussians, camera, pose_tensor(T_cam_world, gaussians.means.device))
+        render = self._render(gaussians, camera, T_cam_world)
         picture = _reference(camera, render, self._config.silhouette_threshold)
         if camera == full:
             return self._levels(picture)
         picture = self._without_edges(picture)
         return [picture, *self._halvings(picture)]
+
+    def _render(self, gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Matrix) -> Render:
+        with torch.no_grad():
+            return self._rasterizer.render(gaussians, camera, pose_tensor(T_cam_world, gaussians.means.device))
 
     def _without_edges(self, picture: _Picture) -> _Picture:
         """What a render blends across an edge is no surface; ``halve`` leaves it out on the way to the other levels."""
@@ -265,6 +281,11 @@ class _Alignment:
 
     state: _State
     fit: _Fit
+
+
+def _rank(result: TrackingResult) -> tuple[bool, float]:
+    """Of two, the larger is to be believed."""
+    return not result.failure, result.inlier_fraction
 
 
 def _frame(view: View) -> _Picture:
