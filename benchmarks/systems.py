@@ -167,7 +167,7 @@ def row(system: SimpleNamespace, outcomes: list[Outcome], open3d_fps: float | No
     ratio = '' if open3d_fps is None else f'{statistics.median(fps) / open3d_fps:.2f}'
     cells = [
         f'`{system.text}`', str(len(outcomes)), f'{min(o.tracked for o in outcomes)}/{outcomes[0].frames}',
-        spread(fps, 1), ratio, spread(known('ate_cm'), 2), spread(known('psnr_db'), 2),
+        spread(fps, 1 if min(fps) > 1 else 3), ratio, spread(known('ate_cm'), 2), spread(known('psnr_db'), 2),
         spread(known('num_gaussians'), 0, False), spread(known('peak_rss_mb'), 0, False),
     ]  # fmt: skip
     return '| ' + ' | '.join(cells) + ' |'
