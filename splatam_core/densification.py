@@ -9,7 +9,8 @@ from torch import Tensor
 
 from splatam_core.config import DensificationConfig
 from splatam_core.filters import box_sums, median
-from splatam_core.rasterizer import Gaussians, Rasterizer, Render, joined
+from splatam_core.gaussian_map import GaussianMap
+from splatam_core.rasterizer import Gaussians, Rasterizer, Render
 from splatam_core.view import View, unproject
 
 MAX_BIAS = 0.1  # share of the depth; pixels that are farther off see another surface
@@ -17,20 +18,20 @@ BIAS_WINDOW = 5  # pixels
 
 
 def densify(
-    gaussians: Gaussians, view: View, T_cam_world: Tensor, rasterizer: Rasterizer, config: DensificationConfig
-) -> Gaussians:
-    """The Gaussians to add so that the map explains the view."""
+    gaussian_map: GaussianMap, view: View, T_cam_world: Tensor, rasterizer: Rasterizer, config: DensificationConfig
+) -> None:
+    """Add the Gaussians that make the map explain the view."""
     view = view.narrowed(config.scale, config.max_width)
+
+    def render() -> Render:
+        return rasterizer.render(gaussian_map.gaussians.detached(), view.camera, T_cam_world)
+
     with torch.no_grad():
-        render = rasterizer.render(gaussians.detached(), view.camera, T_cam_world)
-        chosen = unexplained(render, view, config)
-        depth = view.depth
-        new = new_gaussians(view, chosen, depth, T_cam_world, config.opacity)
+        chosen, depth = unexplained(render(), view, config), view.depth
+        gaussian_map.append(new_gaussians(view, chosen, depth, T_cam_world, config.opacity))
         for _ in range(config.settle):
-            render = rasterizer.render(joined(gaussians.detached(), new), view.camera, T_cam_world)
-            depth = depth - depth_bias(render, view)
-            new = new_gaussians(view, chosen, depth, T_cam_world, config.opacity)
-    return new
+            depth = depth - depth_bias(render(), view)
+            gaussian_map.replace_last(new_gaussians(view, chosen, depth, T_cam_world, config.opacity))
 
 
 def depth_bias(render: Render, view: View) -> Tensor:

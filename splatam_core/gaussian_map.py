@@ -83,19 +83,26 @@ class GaussianMap:
         Raises:
             RasterizerError: anisotropic ones, to an isotropic map.
         """
+        new = self._of_its_kind(new)
         self.stop_optimization()
-        if self.is_anisotropic:
-            new = new.anisotropic()
-        else:
-            check_isotropic(new)
         old_size, self._size = self._size, self._size + len(new)
         self._make_room()
-        for name in self._names:
-            self._room[name][old_size : self._size] = getattr(new, name)
         for name in ('first_second', 'steps'):
             self._room[name][old_size : self._size] = 0
         self._show()
-        self._measure(old_size // BLOCK)
+        self.replace_last(new)
+
+    def replace_last(self, new: Gaussians) -> None:
+        """Put others in the place of as many that were added last; what has been moved since is not for this.
+
+        Raises:
+            RasterizerError: anisotropic ones, to an isotropic map.
+        """
+        assert self._optimizer is None
+        new, begin = self._of_its_kind(new), self._size - len(new)
+        for name in self._names:
+            self._room[name][begin : self._size] = getattr(new, name)
+        self._measure(begin // BLOCK)
 
     def keep(self, kept: Tensor) -> None:
         """Drop all Gaussians but those where ``kept`` [N] is true; gradients and moments of the others stay."""
@@ -197,6 +204,12 @@ class GaussianMap:
             values.copy_(torch.from_numpy(arrays[name]))
         self._size, self._room, self._bounds, self._optimizer = size, room, bounds, None
         self._show()
+
+    def _of_its_kind(self, new: Gaussians) -> Gaussians:
+        if self.is_anisotropic:
+            return new.anisotropic()
+        check_isotropic(new)
+        return new
 
     def _show(self) -> None:
         """Let the parameters be the used part of the room, without gradients."""

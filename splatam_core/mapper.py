@@ -84,7 +84,7 @@ class Mapper:
         mapped, every = divmod(index, config.mapping.every)
         if every == 0:
             if mapped % config.densification.every == 0 or sure_fraction < config.densification.when_unsure:
-                self.map.append(densify(self.map.gaussians, view, current.T_cam_world, self._rasterizer, config.densification))
+                densify(self.map, view, current.T_cam_world, self._rasterizer, config.densification)
                 clock.lap('densify')
             if not len(self.map):
                 return False

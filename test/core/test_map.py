@@ -16,6 +16,7 @@ from splatam_core.gaussian_map import PARAMETERS, GaussianMap
 from splatam_core.keyframes import KeyframeStore, PosedView, draw, is_due, overlaps, select_keyframes
 from splatam_core.mapping import FINAL_FIRST, FINAL_LAST, FINAL_MEANS, prunable, refine, refit
 from splatam_core.rasterizer import Gaussians, Moments, Rates, Render, Target, joined, make_rasterizer
+from splatam_core.rasterizer.bounds import block_bounds
 from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.view import View, unproject
 
@@ -66,9 +67,17 @@ def test_a_fresh_wall_renders_above_the_tracking_gate() -> None:
     assert float(render.silhouette[8:16, 8:24].min()) > 0.99
 
 
+def _densified(gaussian_map: GaussianMap, view: View, config: DensificationConfig, threads: int = 1) -> Gaussians:
+    """What was added."""
+    before = len(gaussian_map)
+    densify(gaussian_map, view, EYE, make_rasterizer('cpu', threads), config)
+    g = gaussian_map.gaussians
+    return Gaussians(*(values[before:] for values in (g.means, g.log_scales, g.logit_opacities, g.rgb)))
+
+
 def test_densification_adds_nothing_where_the_map_explains_the_view() -> None:
     view = _view()
-    added = densify(_map(view).gaussians, view, EYE, make_rasterizer('cpu', 1), DensificationConfig())
+    added = _densified(_map(view), view, DensificationConfig())
     assert len(added) == 0
 
 
@@ -78,7 +87,7 @@ def test_densification_adds_unmapped_pixels_with_a_reading() -> None:
     unseen[:, 16:] = False
     half = GaussianMap()
     half.append(new_gaussians(view, unseen, view.depth, EYE, 0.5))
-    added = densify(half.gaussians, view, EYE, make_rasterizer('cpu', 1), DensificationConfig())
+    added = _densified(half, view, DensificationConfig())
     u = CAMERA.fx * added.means[:, 0] / added.means[:, 2] + CAMERA.cx
     assert 24 * 13 <= len(added) <= 24 * 16
     assert float(u.min()) > 15.5
@@ -101,16 +110,15 @@ def test_densification_adds_what_stands_in_front_of_the_map() -> None:
 
 def test_densification_at_half_resolution_adds_a_quarter_of_wider_gaussians() -> None:
     view = _view()
-    empty = GaussianMap()
-    added = densify(empty.gaussians, view, EYE, make_rasterizer('cpu', 1), DensificationConfig(scale=0.5))
+    added = _densified(GaussianMap(), view, DensificationConfig(scale=0.5))
     assert len(added) == 24 * 32 // 4
     torch.testing.assert_close(added.log_scales.exp(), torch.full((192, 1), 2.0 / 15.0))
 
 
 @pytest.mark.parametrize(('max_width', 'width'), [(0, 32), (64, 32), (16, 16), (8, 8)])
 def test_the_width_of_the_image_bounds_how_many_are_added(max_width: int, width: int) -> None:
-    rasterizer, config = make_rasterizer('cpu', 1), DensificationConfig(max_width=max_width)
-    assert len(densify(GaussianMap().gaussians, _view(), EYE, rasterizer, config)) == width * width * 3 // 4
+    added = _densified(GaussianMap(), _view(), DensificationConfig(max_width=max_width))
+    assert len(added) == width * width * 3 // 4
 
 
 def test_settled_gaussians_render_at_the_depth_they_were_read_at() -> None:
@@ -121,7 +129,7 @@ def test_settled_gaussians_render_at_the_depth_they_were_read_at() -> None:
     rasterizer = make_rasterizer('cpu', 1)
     bias = []
     for rounds in (0, 3):
-        fresh = densify(GaussianMap().gaussians, view, EYE, rasterizer, DensificationConfig(settle=rounds))
+        fresh = _densified(GaussianMap(), view, DensificationConfig(settle=rounds))
         render = rasterizer.render(fresh, CAMERA, EYE)
         bias.append(float((render.depth() - depth)[4:-4, 4:-4].mean()))
     assert bias[0] < -0.01
@@ -399,6 +407,9 @@ def test_joined_gaussians_are_bounded_as_one_map_of_them(old: int, new: int) -> 
     together = joined(gaussian_map.gaussians, more)
     gaussian_map.append(more)
     assert torch.equal(together.bounds, gaussian_map.gaussians.bounds)
+    gaussian_map.replace_last(moved := replace(more, means=more.means + 1))
+    assert torch.equal(torch.cat([together.means[:old], moved.means]), gaussian_map.means)
+    assert torch.equal(block_bounds(gaussian_map.means, gaussian_map.log_scales), gaussian_map.gaussians.bounds)
     assert len(joined(more, more)) == 2 * new and joined(more, more).bounds is None
 
 
