@@ -17,6 +17,9 @@ from splatam_core.config import KeyframeConfig
 from splatam_core.view import View, unproject
 
 
+_TOGETHER = 64  # keyframes whose overlap is found at once: more would not stay in a core's cache
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedView:
     """A view and where it was taken from.
@@ -211,12 +214,15 @@ def overlaps(points: Tensor, camera: PinholeCamera, keyframes: Sequence[PosedVie
     """Share of world points [K, 3] that the camera, where each view was taken, has more than ``margin`` pixels inside."""
     if not len(points) or not keyframes:
         return [0.0] * len(keyframes)
-    T = torch.cat([keyframe.T_cam_world[:3] for keyframe in keyframes])  # [3 N, 4]
     homogeneous = torch.cat([points.T, points.new_ones(1, len(points))])  # [4, K]
-    x, y, z = (T @ homogeneous).view(len(keyframes), 3, -1).unbind(1)  # [N, K] each; one product, not N small ones
-    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    inside = (u > margin) & (u < camera.width - margin) & (v > margin) & (v < camera.height - margin) & (z > 0)
-    return inside.float().mean(dim=1).tolist()
+    shares: list[float] = []
+    for begin in range(0, len(keyframes), _TOGETHER):
+        T = torch.stack([keyframe.T_cam_world for keyframe in keyframes[begin : begin + _TOGETHER]])
+        x, y, z = (T[:, :3].reshape(-1, 4) @ homogeneous).view(len(T), 3, -1).unbind(1)  # [N, K] each, by one product
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        inside = (u > margin) & (u < camera.width - margin) & (v > margin) & (v < camera.height - margin) & (z > 0)
+        shares += inside.float().mean(dim=1).tolist()
+    return shares
 
 
 def draw(window: Sequence[PosedView], config: KeyframeConfig, rng: np.random.Generator) -> PosedView:
