@@ -189,12 +189,13 @@ def plot(path: Path, systems: list[SimpleNamespace], outcomes: dict[str, list[Ou
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(figsize=(6, 4), layout='constrained')
+    highest_cm = max(statistics.median(o.ate_cm for o in outcomes[system.text]) for system in systems)
     for index, system in enumerate(systems):
         done = outcomes[system.text]
         x, y = (statistics.median(values) for values in ([o.frames / o.seconds for o in done], [o.ate_cm for o in done]))
         axes.plot(x, y, 'o')
         axes.annotate(system.text, (x, y), xytext=(5, 4 if index % 2 else -12), textcoords='offset points')
-    axes.set(xscale='log', xlabel='frames per second', ylabel='ATE RMSE, cm', title=title, ylim=(0, None))
+    axes.set(xscale='log', xlabel='frames per second', ylabel='ATE RMSE, cm', title=title, ylim=(0, 1.15 * highest_cm))
     axes.margins(x=0.25)  # names are to the right of their points
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=120)
