@@ -13,11 +13,12 @@ PYTHON ?= $(firstword $(FINDABLE))
 export SPLATAM_DATA ?= $(abspath ../shared/data)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup test tf2_msgs demo paper-tables colcon check-aarch64 clean
+.PHONY: help setup test lint tf2_msgs demo paper-tables colcon check-aarch64 clean
 
 help:
 	@echo 'make setup           make $(VENV) with everything in it (PYTHON=python3.11 chooses the interpreter)'
 	echo 'make test            run the whole test suite'
+	echo 'make lint            style and likely mistakes, by ruff'
 	echo 'make tf2_msgs        build the messages of /tf into $(VENV), for a ROS from pip, which lacks them'
 	echo 'make demo [BAG=path] play a recording into the node and score what comes out, in out/demo'
 	echo 'make paper-tables    ablations, metrics and held-out views on the recordings in SPLATAM_DATA: hours, and goes on where it stopped'
@@ -54,6 +55,10 @@ $(VENV)/.tf2_msgs: tools/tf2_msgs.py | $(VENV)/.installed
 
 test: setup tf2_msgs
 	@$(BIN)/python -m pytest -q
+
+lint: $(VENV)/.created
+	@$(BIN)/python -m pip install --quiet -c constraints.txt ruff
+	$(BIN)/python -m ruff check .
 
 demo: setup
 	@$(BIN)/python -m splatam_ros.demo $(if $(BAG),'$(BAG)')

@@ -85,7 +85,7 @@ def finish() -> None:
 def median_ms(function: Callable[[], object], runs: int) -> float:
     """Of so many runs after three that do not count: compilation, room for lists, allocation."""
     times = []
-    for run in range(3 + runs):
+    for _ in range(3 + runs):
         finish()
         start = time.perf_counter()
         function()

@@ -167,7 +167,8 @@ def print_roofline() -> None:
         rates = best_rates(threads)
         for size in SIZES:
             cam = camera(*size)
-            cells = [f'{w.operations / 1e6:.0f}, {w.moved / 1e6:.0f} | {w.roofline_ms(rates):.1f}' for w in work(wavy_wall(cam), cam)]
+            passes = work(wavy_wall(cam), cam)
+            cells = [f'{w.operations / 1e6:.0f}, {w.moved / 1e6:.0f} | {w.roofline_ms(rates):.1f}' for w in passes]
             best = f'{rates.operations / 1e9:.0f} | {rates.moved / 1e9:.1f}'
             print(f'| {threads} | {best} | {cam.width}x{cam.height} | {cells[0]} | {cells[1]} |', flush=True)
 

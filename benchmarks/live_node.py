@@ -121,7 +121,8 @@ def main() -> None:
         ]  # fmt: skip
     name = Path(args.source).name
     print_header(f'{name} live at {args.rate:g} Hz, preset `{args.preset}`, {args.width} pixels wide', args.runs)
-    print('| run | latency ms, median | p95 | dropped before the first pose | frames after it | dropped % | lost | CPU % of a core | RSS MB |')
+    print('| run | latency ms, median | p95 | dropped before the first pose | frames after it | dropped % | lost '
+          '| CPU % of a core | RSS MB |')  # fmt: skip
     print('|---|---|---|---|---|---|---|---|---|')
     for number, run in enumerate(runs, 1):
         print(row(number, run))

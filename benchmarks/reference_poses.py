@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from header import print_header
@@ -28,7 +29,7 @@ NEIGHBOURS = 5
 
 def steps(T_world_cam: NDArray[np.float64]) -> NDArray[np.float64]:
     """[N - 1, 6] twists from each pose to the next."""
-    return np.array([se3.log(se3.inverse(a) @ b) for a, b in zip(T_world_cam[:-1], T_world_cam[1:])])
+    return np.array([se3.log(se3.inverse(a) @ b) for a, b in pairwise(T_world_cam)])
 
 
 def without_step(T_world_cam: NDArray[np.float64], at: int) -> NDArray[np.float64]:
@@ -77,7 +78,9 @@ def main() -> None:
     print_header(f'Reference poses of {sequence.name}', 1)
 
     lengths = np.linalg.norm(steps(truth.T_world_cam), axis=1)
-    at = int(np.argmax(lengths[1:-1] / np.array([np.median(lengths[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1]) for i in range(1, len(lengths) - 1)]))) + 1
+    inner = range(1, len(lengths) - 1)
+    usual = np.array([np.median(lengths[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1]) for i in inner])
+    at = int(np.argmax(lengths[1:-1] / usual)) + 1
     twist = steps(truth.T_world_cam)[at]
     around = steps(truth.T_world_cam)[[at - 2, at - 1, at + 1, at + 2]]
     print(

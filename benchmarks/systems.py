@@ -3,9 +3,9 @@
     python benchmarks/systems.py SOURCE [--width 320] [--runs 5] [--systems realtime,quick,open3d,opencv] [--plot FILE.png]
 
 Every run is a process of its own, one after the other, the systems taking turns; frames are decoded before the clock
-starts. Run k of a preset has seed k. A system is a preset, ``open3d`` (``pip install open3d``; voxel-block grid, 3.0/512 m voxels, frame to model) or
-``opencv`` (frame to frame, no map). ``NAME:60`` runs on the first 60 frames, ``NAME*1`` once instead of --runs times;
-``NAME[key=value;...]`` changes settings of a preset.
+starts. Run k of a preset has seed k. A system is a preset, ``open3d`` (``pip install open3d``; voxel-block grid, 3.0/512 m
+voxels, frame to model) or ``opencv`` (frame to frame, no map). ``NAME:60`` runs on the first 60 frames, ``NAME*1`` once
+instead of --runs times; ``NAME[key=value;...]`` changes settings of a preset.
 """
 
 from __future__ import annotations
@@ -83,7 +83,8 @@ def run_open3d(frames: Sequence[RgbdFrame]) -> tuple[Poses, float]:
     poses: Poses = []
     begin = time.perf_counter()
     for index, frame in enumerate(frames):
-        live.set_data_from_image('depth', o3d.t.geometry.Image(o3d.core.Tensor(np.rint(1000 * frame.depth_m).astype(np.uint16)[..., None])))
+        depth_mm = np.rint(1000 * frame.depth_m).astype(np.uint16)
+        live.set_data_from_image('depth', o3d.t.geometry.Image(o3d.core.Tensor(depth_mm[..., None])))
         live.set_data_from_image('color', o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(frame.rgb))))
         if index > 0:
             tracked = model.track_frame_to_model(live, rendered, 1000.0, 4.0, 0.07)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import array
 import importlib
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -60,7 +60,7 @@ class RosbagsMessages:
         return message_class(**fields)
 
 
-@lru_cache(maxsize=None)
+@cache
 def _message_class(type_name: str) -> type:
     package, _, name = type_name.partition('/msg/')
     try:

@@ -11,14 +11,14 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Union, get_type_hints
+from typing import Any, get_type_hints
 
 import yaml
 
 from splatam_core.errors import ConfigError, one_line
 from splatam_core.resources import config_dir
 
-Value = Union[bool, int, float, str]
+Value = bool | int | float | str
 
 DEVICES = ('auto', 'cpu', 'cuda')
 WHERE = frozenset({'device', 'rasterizer', 'keyframes.on_device'})
@@ -127,8 +127,8 @@ class TrackingConfig:
     )  # fmt: skip
     features: bool = _setting(
         True,
-        "Of alignment: where that does not help, start from features (ORB, PnP) that the frame shares with the map as seen from "
-        "the last pose.",
+        'Of alignment: where that does not help, start from features (ORB, PnP) that the frame shares with the map as seen from '
+        'the last pose.',
     )
     lag: bool = _setting(True, 'Of alignment: take up that colour and depth of a frame were taken at different times.')
     rotation_rate: float = _setting(4e-4, 'Adam step of the unit quaternion.', '', 0.0)
@@ -254,7 +254,9 @@ class MappingConfig:
     opacity_rate: float = _setting(0.05, 'Adam step of the opacity logits.', '', 0.0)
     scale_rate: float = _setting(1e-3, 'Adam step of the log scales.', '', 0.0)
     rotation_rate: float = _setting(1e-3, "Adam step of anisotropic Gaussians' unit quaternions.", '', 0.0)
-    prune_every: int = _setting(20, 'Prune before every n-th step of a frame; fused fitting, after the last step of each; 0 = never.', 'steps', 0)
+    prune_every: int = _setting(
+        20, 'Prune before every n-th step of a frame; fused fitting, after the last step of each; 0 = never.', 'steps', 0
+    )
     prune_from: int = _setting(0, 'First step of a frame that may prune. Not of fused fitting.', 'steps', 0)
     prune_until: int = _setting(20, 'Last step of a frame that may prune or reset opacities. Not of fused fitting.', 'steps', 0)
     prune_opacity: float = _setting(0.005, 'Prune Gaussians fainter than this.', '', 0.0, 1.0)
@@ -270,8 +272,10 @@ class MappingConfig:
     prune_share: float = _setting(
         0.0, 'Of fused fitting: prune only once this share of the map is to go; the map is copied then.', '', 0.0, 1.0
     )
-    scene_radius_ratio: float = _setting(3.0, 'Scene radius = deepest reading of the first frame / this; more once a later one sees so far that new '
-        'Gaussians would be too wide.', '', 0.1)
+    scene_radius_ratio: float = _setting(
+        3.0, 'Scene radius = deepest reading of the first frame / this; more once a later one sees so far that new Gaussians '
+        'would be too wide.', '', 0.1,
+    )  # fmt: skip
 
     def is_held_out(self, index: int) -> bool:
         """Whether a frame, counted from 0, is kept out of the map: frames n - 1, 2n - 1, ..."""

@@ -16,7 +16,6 @@ from splatam_core.camera import PinholeCamera
 from splatam_core.config import KeyframeConfig
 from splatam_core.view import View, unproject
 
-
 _TOGETHER = 64  # keyframes whose overlap is found at once: more would not stay in a core's cache
 
 

@@ -191,7 +191,9 @@ def _check_values(path: Path, values: dict[str, NDArray[np.float32]]) -> None:
 
 def _check_rotations(path: Path, values: dict[str, NDArray[np.float32]]) -> None:
     if missing := [name for name in ROTATION if name not in values]:
-        raise MapFileError(f'{path}: scale_0, scale_1 and scale_2 differ, so rotations are needed; no property {", ".join(missing)}')
+        raise MapFileError(
+            f'{path}: scale_0, scale_1 and scale_2 differ, so rotations are needed; no property {", ".join(missing)}'
+        )
     without = ~np.any([values[name] for name in ROTATION], axis=0)
     if without.any():
         raise MapFileError(f'{path}: {int(without.sum())} of {len(without)} Gaussians have a quaternion of length zero')

@@ -1,7 +1,7 @@
-"""Files of values and arrays that are whole or refused, and in which nothing can be executed.
+r"""Files of values and arrays that are whole or refused, and in which nothing can be executed.
 
 One line of ASCII, ``splatam_ros KIND VERSION SHA-256 of the rest``, then an npz archive: the arrays, and the values as JSON
-in the array ``values``. ``numpy.load(io.BytesIO(path.read_bytes().split(b'\\n', 1)[1]))`` reads it without this package.
+in the array ``values``. ``numpy.load(io.BytesIO(path.read_bytes().split(b'\n', 1)[1]))`` reads it without this package.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def unseal(path: Path, kind: str, version: int, digest: str | None = None) -> Co
 def _stated_digest(path: Path, header: bytes, kind: str, version: int) -> str:
     words = header.decode('ascii', 'replace').split(' ')
     if words[:2] != [MAGIC, kind] or len(words) != 4:
-        raise CheckpointError(f"{path}: is no {kind} of {MAGIC}, or damaged: it begins with {header[:32]!r}")
+        raise CheckpointError(f'{path}: is no {kind} of {MAGIC}, or damaged: it begins with {header[:32]!r}')
     if words[2] != str(version):
         raise CheckpointError(
             f'{path}: is of format {words[2]!r} and this version reads format {version}: use the version that wrote it'

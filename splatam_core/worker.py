@@ -147,7 +147,7 @@ class SlamWorker:
             while (job := self._next()) is not None:
                 job()
                 self._done()
-        except Exception as error:  # whatever it is, it surfaces in stop()
+        except Exception as error:  # noqa: BLE001 - whatever it is, it surfaces in stop()
             self._fail(error)
 
     def _next(self) -> Callable[[], None] | None:
@@ -179,7 +179,7 @@ class SlamWorker:
             return
         try:
             future.set_result(function(self._slam))
-        except Exception as error:  # the caller's function, the caller's exception
+        except Exception as error:  # noqa: BLE001 - the caller's function, the caller's exception
             future.set_exception(error)
 
     def _done(self) -> None:

@@ -232,7 +232,7 @@ class SplatamNode(Node):
             action()
         except (SplatamError, OSError) as error:
             self.get_logger().error(f'{what} failed: {error}')
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 - the rest of the shutdown is to happen
             self.get_logger().error(f'{what} failed:\n{"".join(traceback.format_exception(error))}')
         else:
             return True

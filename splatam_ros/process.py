@@ -96,5 +96,5 @@ def ros(arguments: Sequence[str]) -> Iterator[None]:
 
 
 def _first_sentence(error: Exception) -> str:
-    """rcl's message without its own preamble, and without the source lines it appends."""
+    """Rcl's message without its own preamble, and without the source lines it appends."""
     return str(error).split(', at /')[0].removeprefix('failed to initialize rcl: ')

@@ -66,7 +66,7 @@ class ReadAhead:
             for message in self._messages:
                 if not self._put(message):
                     break
-        except Exception as error:  # whatever it is, it surfaces where messages are taken
+        except Exception as error:  # noqa: BLE001 - whatever it is, it surfaces where messages are taken
             self._error = error
         with self._changed:
             self._is_over = True

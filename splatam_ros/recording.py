@@ -177,7 +177,7 @@ class Recording:
 
 
 def message_class(type_name: str) -> type:
-    """rclpy's class of a message type such as ``sensor_msgs/msg/Image``.
+    """Rclpy's class of a message type such as ``sensor_msgs/msg/Image``.
 
     Raises:
         LookupError: the type is not installed here.

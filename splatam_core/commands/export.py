@@ -129,4 +129,6 @@ def _true_poses(run: RunRecord) -> NDArray[np.float64]:
     return poses
 
 
-COMMAND = Command('export', "write a run's map as Gaussians, points, a mesh, or for the original's programs", _add_arguments, export)
+COMMAND = Command(
+    'export', "write a run's map as Gaussians, points, a mesh, or for the original's programs", _add_arguments, export
+)

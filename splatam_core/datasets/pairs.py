@@ -120,7 +120,7 @@ class ImagePairs:
         return FrameFactory(calibration, self._width, self._depth.camera_of(calibration.pinhole), rectified)
 
 
-def _check_size(pairs: list[Pair], calibration: CameraCalibration) -> None:
+def _check_size(pairs: Sequence[ImagePair], calibration: CameraCalibration) -> None:
     """Make sure that the camera is that of the images: otherwise every frame would be left out, one by one."""
     for pair in pairs:
         try:

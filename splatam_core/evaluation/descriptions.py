@@ -79,13 +79,13 @@ DESCRIPTIONS: dict[str, tuple[Description, ...]] = {
         Description('lost', 'lost', '', 1, ',d', 'Without a pose; they change no map.'),
         Description('fps', 'speed', 'fps', 1, '.2f', 'Frames by the time spent in SLAM, decoding excluded.'),
         Description('fps_with_io', 'speed with decoding', 'fps', 1, '.2f', 'The same, decoding included.'),
-        Description('finish_s', 'fitting after the last frame', 's', 1, '.2f', 'Of the time in SLAM, that spent when all frames were done.'),
+        Description('finish_s', 'fitting after the last frame', 's', 1, '.2f', 'Of the time in SLAM, that after the last frame.'),
         Description('num_gaussians', 'Gaussians', '', 1, ',d', 'Size of the final map.'),
         Description('peak_rss_mb', 'peak memory', 'MiB', 1, ',.0f', 'Most memory the process held.'),
         Description('peak_gpu_mb', 'peak memory of the GPU', 'MiB', 1, ',.0f', "Most memory the process's tensors took on a GPU."),
     ),
     'Trajectory': (
-        Description('ate_rmse_m', 'ATE RMSE', 'cm', 100, '.3f', 'Root mean squared distance of the camera centres, aligned rigidly.'),
+        Description('ate_rmse_m', 'ATE RMSE', 'cm', 100, '.3f', 'Root mean squared distance of camera centres, aligned rigidly.'),
         Description('ate_frames', 'frames with a truth', '', 1, ',d', 'Tracked frames that entered the ATE.'),
         Description('rpe_trans_frame_m', 'RPE a frame', 'mm', 1e3, '.3f', 'Error of the motion from one frame to the next.'),
         Description('rpe_rot_frame_deg', 'RPE a frame, rotation', 'deg', 1, '.4f', 'The same, of the rotation.'),
@@ -111,7 +111,7 @@ DESCRIPTIONS: dict[str, tuple[Description, ...]] = {
     'Novel views: a test split at its true poses': (
         *_images('novel_', 'views without holes'),
         Description('novel_frames', 'views', '', 1, ',d', 'Views without holes.'),
-        Description('novel_alignment', 'alignment', '', 1, '', 'What brought the truth into the map: whole trajectory, or first pose.'),
+        Description('novel_alignment', 'alignment', '', 1, '', 'What brought the truth into the map: trajectory, or first pose.'),
     ),
     'Novel views with holes': (
         *_images('novel_holes_', 'views that see more than 0.1 % unmapped surface'),

@@ -196,7 +196,8 @@ def _timings(metrics: Metrics) -> str:
         f'<tr><td>{escape(stage)}</td><td class="n">{times.median:.1f}</td><td class="n">{times.p95:.1f}</td></tr>'
         for stage, times in metrics.timings_ms.items()
     )
-    return f'<table class="narrow"><tr><th>stage</th><th class="n">median ms</th><th class="n">95 % below ms</th></tr>{rows}</table>'
+    head = '<tr><th>stage</th><th class="n">median ms</th><th class="n">95 % below ms</th></tr>'
+    return f'<table class="narrow">{head}{rows}</table>'
 
 
 def _metrics(metrics: Metrics) -> Iterator[str]:

@@ -1,8 +1,8 @@
 """The kernels of the ``triton`` rasterizer: project, list, blend, and the same way back.
 
 One program blends one tile, a chunk of Gaussians at a time: within a chunk the transmittance in front of each is a running
-product. Gradients of a list's entries go to the places which the entries had before they were sorted by tile: there those of one Gaussian
-lie side by side, and are summed without atomics.
+product. Gradients of a list's entries go to the places which the entries had before they were sorted by tile: there those of
+one Gaussian lie side by side, and are summed without atomics.
 
 An isotropic footprint is separable, but not to advantage here: a tile of 8x8 pixels is two a thread, which share a column, so
 three exponentials would take the place of two.

@@ -15,7 +15,6 @@ import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Union
 
 import cv2
 import numpy as np
@@ -35,7 +34,7 @@ from splatam_core.tracking.torch_aligner import TorchAligner
 from splatam_core.view import View
 
 Array = NDArray[np.float32]
-Image = Union[Array, Tensor]  # on the host; elsewhere
+Image = Array | Tensor  # on the host; elsewhere
 Matrix = NDArray[np.float64]
 
 _COARSEST_PX = 32  # smaller images show too little to align

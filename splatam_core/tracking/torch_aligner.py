@@ -58,7 +58,10 @@ class TorchAligner:
             brightness: of the reference.
             depth: of the reference.
             layers: of the frame.
-            fx, fy, cx, cy: of both.
+            fx: of both.
+            fy: of both.
+            cx: of both.
+            cy: of both.
             light_motion: [4, 4] from the reference's camera to the frame's, when colour was taken.
             depth_motion: [4, 4] when depth was taken.
             velocity: [6] twist by which the former moves as colour lags more.

@@ -160,7 +160,8 @@ def test_binning_that_leaves_nothing_is_an_error(info):
 
 def test_the_camera_of_rectified_images_is_p(info):
     """An image_rect topic: D is the lens's still, but the images are bent straight already, to P."""
-    message = info(d=[0.1, -0.2, 0.0, 0.0, 0.0], p=[400.0, 0.0, 310.0, 0.0, 0.0, 410.0, 230.0, 0.0, 0.0, 0.0, 1.0, 0.0], binning_x=2)
+    p = [400.0, 0.0, 310.0, 0.0, 0.0, 410.0, 230.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    message = info(d=[0.1, -0.2, 0.0, 0.0, 0.0], p=p, binning_x=2)
     camera = parameters(message, is_rectified=True)
     assert (camera.distortion_model, camera.distortion) == ('none', ())
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (200.0, 410.0, 310.5 / 2 - 0.5, 230.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import dataclass
+from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -382,7 +383,7 @@ def assert_sound(feed, config):
         assert len(set(serials)) == len(serials)
         # Colour and depth both increase until time jumps back.
         order = [(s.resets, getattr(s, name).stamp_ns) for s in feed.sets]
-        assert all(a < b for a, b in zip(order, order[1:]))
+        assert all(a < b for a, b in pairwise(order))
     interval = config['max_interval_ns'] if config['mode'] == 'approximate' else 0
     assert all(abs(c - d) <= interval for c, d in feed.pairs)
     assert all(s.color.stream == 'color' and s.depth.stream == 'depth' and s.info.stream == 'info' for s in feed.sets)
@@ -416,7 +417,7 @@ def test_no_two_neighbours_could_have_had_each_other(color, depth, interval):
     pairs = Feed('approximate', max_interval_ns=interval, queue_size=25).add('color', *color).add('depth', *depth)
     pairs = pairs.flush().pairs
     fences = [(-1, -1), *pairs, (1000, 1000)]
-    for (c0, d0), (c1, d1) in zip(fences, fences[1:]):
+    for (c0, d0), (c1, d1) in pairwise(fences):
         left_color = [c for c in color if c0 < c < c1]
         left_depth = [d for d in depth if d0 < d < d1]
         assert not [(c, d) for c in left_color for d in left_depth if abs(c - d) <= interval]

@@ -77,7 +77,10 @@ def test_choices_without_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     ('overrides', 'message'),
     [
         (('device=cuda',), r"device = cuda: torch \S+ .*sees no GPU; install torch's CUDA build .* or set device=cpu"),
-        (('rasterizer=triton',), f'rasterizer = triton: needs a GPU, and torch .* sees no GPU; set rasterizer=auto, or set {INTERPRET}=1'),
+        (
+            ('rasterizer=triton',),
+            f'rasterizer = triton: needs a GPU, and torch .* sees no GPU; set rasterizer=auto, or set {INTERPRET}=1',
+        ),
         (('rasterizer=triton', 'device=cpu'), 'rasterizer = triton: needs a GPU, and device = cpu; set rasterizer=auto'),
     ],
 )

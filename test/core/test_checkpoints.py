@@ -365,7 +365,7 @@ def test_a_disk_that_is_full_does_not_stop_slam(
     assert len(said) == FRAMES - 2 and all('File too large; going on' in line for line in said)
     assert result(tmp_path / 'run') == result(whole['quick'])
     assert len(checkpoint_paths(tmp_path / 'run' / 'checkpoints')) == 2  # once there was room
-    assert not [path for path in (tmp_path / 'run').rglob('.*')]
+    assert not list((tmp_path / 'run').rglob('.*'))
 
 
 # --- what is refused ---

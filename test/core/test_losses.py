@@ -61,7 +61,10 @@ def test_losses_leave_out_outliers_of_depth() -> None:
     tracked = [tracking_loss(render, view, TrackingConfig(depth_outlier_ratio=ratio)) for ratio in (0.0, 10.0)]
     assert [loss.num_pixels for loss in tracked] == [18, 17]
     assert [float(loss.depth) for loss in tracked] == pytest.approx([17 * 0.1 + 10.0, 17 * 0.1], rel=1e-5)
-    mapped = [mapping_loss(render, view, MappingConfig(ssim_weight=0.0, color_weight=0.0, depth_outlier_ratio=r)) for r in (0.0, 10.0)]
+    mapped = [
+        mapping_loss(render, view, MappingConfig(ssim_weight=0.0, color_weight=0.0, depth_outlier_ratio=ratio))
+        for ratio in (0.0, 10.0)
+    ]
     assert [float(loss) for loss in mapped] == pytest.approx([(17 * 0.1 + 10.0) / 18, 0.1], rel=1e-5)
     blind = View(CAMERA, GRAY, torch.zeros(4, 6))
     assert float(tracking_loss(render, blind, TrackingConfig(depth_outlier_ratio=10.0)).total) == 0.0

@@ -79,7 +79,8 @@ def test_lists_without_room_change_nothing_but_the_time() -> None:
     loss, first = _fit(roomy, SCENE)
     same_loss, same_first = _fit(cramped, SCENE)
     assert same_loss == pytest.approx(loss, rel=1e-5)
-    assert float((same_first - first).abs().max()) < 1e-3 * float(first.abs().max())  # residuals near zero take their slope from rounding
+    # Residuals near zero take their slope from rounding.
+    assert float((same_first - first).abs().max()) < 1e-3 * float(first.abs().max())
 
 
 def _fit(rasterizer: TritonRasterizer, scene: Scene) -> tuple[float, torch.Tensor]:

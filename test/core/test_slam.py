@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -410,7 +411,7 @@ def test_few_gaussians_are_added_between_the_frames_whose_turn_it_is(
         changes = ['mapping.every=1', 'mapping.prune_every=0', 'densification.every=3']
         slam = _slam(*changes, f'densification.when_unsure={when_unsure}')
         sizes = [slam.process(frame).num_gaussians for frame in frames[:6]]
-        assert [b > a for a, b in zip(sizes, sizes[1:], strict=False)] == grows
+        assert [b > a for a, b in pairwise(sizes)] == grows
 
 
 def test_the_first_frame_has_steps_of_its_own(
@@ -447,7 +448,8 @@ def test_tracking_leaves_the_map_alone(room: tuple[list[RgbdFrame], list[np.ndar
     slam = _slam()
     slam.process(frames[0])
     before = slam.snapshot()
-    make_tracker(make_rasterizer('cpu', 1), TrackingConfig(iterations=3)).track(View.from_frame(frames[1], slam.config.depth), slam.map.gaussians, np.eye(4))
+    view = View.from_frame(frames[1], slam.config.depth)
+    make_tracker(make_rasterizer('cpu', 1), TrackingConfig(iterations=3)).track(view, slam.map.gaussians, np.eye(4))
     assert np.array_equal(before.means, slam.snapshot().means)
     assert slam.map.means.grad is None
 

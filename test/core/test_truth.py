@@ -82,7 +82,8 @@ def test_tracking_at_half_the_resolution(method: str) -> None:
     """Maps at the whole resolution, and tracks with half the pixels: within 2 cm, half a pixel there at 2.5 m."""
     sequence = open_sequence('synthetic', width=160, max_frames=3)
     truth = sequence.ground_truth().T_world_cam
-    slam = Slam(load_config('quick', [*QUICK, f'tracking.method={method}', 'tracking.scale=0.5', 'tracking.iterations=40', 'mapping.iterations=10']))
+    changes = [f'tracking.method={method}', 'tracking.scale=0.5', 'tracking.iterations=40', 'mapping.iterations=10']
+    slam = Slam(load_config('quick', [*QUICK, *changes]))
     results = [slam.process(sequence[index]) for index in range(3)]
     assert [result.status for result in results] == [Status.INITIALIZED, Status.TRACKED, Status.TRACKED]
     assert results[0].num_gaussians > 0.9 * 160 * 120  # densified at the whole resolution
