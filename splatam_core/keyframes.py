@@ -70,7 +70,7 @@ class KeyframeStore(Sequence[PosedView]):
             copy: the same on the device, if it is there.
         """
         self._kept.append(keyframe)
-        if 0 < self.config.budget < len(self._kept):
+        while 0 < self.config.budget < len(self._kept):
             self._copies.pop(self._kept.pop(least_needed(self._kept)), None)
         if copy is not None and copy.view.depth.device != keyframe.view.depth.device:
             self._remember(keyframe, copy)
