@@ -45,7 +45,7 @@ def pose_by_features(render: Render, view: View) -> Matrix | None:
         return None
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
-    return T
+    return T if np.isfinite(T).all() else None
 
 
 def _matches(render: Render, view: View) -> tuple[Matrix, Matrix]:
