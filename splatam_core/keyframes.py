@@ -213,15 +213,30 @@ def overlaps(points: Tensor, camera: PinholeCamera, keyframes: Sequence[PosedVie
     """Share of world points [K, 3] that the camera, where each view was taken, has more than ``margin`` pixels inside."""
     if not len(points) or not keyframes:
         return [0.0] * len(keyframes)
+    T = torch.stack([keyframe.T_cam_world for keyframe in keyframes])[:, :3]  # [N, 3, 4]
+    shares = torch.zeros(len(T))
+    near = _may_see(points, camera, T).nonzero()[:, 0]  # of a long way, few
     homogeneous = torch.cat([points.T, points.new_ones(1, len(points))])  # [4, K]
-    shares: list[float] = []
-    for begin in range(0, len(keyframes), _TOGETHER):
-        T = torch.stack([keyframe.T_cam_world for keyframe in keyframes[begin : begin + _TOGETHER]])
-        x, y, z = (T[:, :3].reshape(-1, 4) @ homogeneous).view(len(T), 3, -1).unbind(1)  # [N, K] each, by one product
+    for chosen in near.split(_TOGETHER):
+        x, y, z = (T[chosen].reshape(-1, 4) @ homogeneous).view(len(chosen), 3, -1).unbind(1)  # [N, K] each, by one product
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         inside = (u > margin) & (u < camera.width - margin) & (v > margin) & (v < camera.height - margin) & (z > 0)
-        shares += inside.float().mean(dim=1).tolist()
-    return shares
+        shares[chosen] = inside.float().mean(dim=1)
+    return shares.tolist()
+
+
+def _may_see(points: Tensor, camera: PinholeCamera, T_cam_world: Tensor) -> Tensor:
+    """[N] false where a sphere about the points is behind the camera at [N, 3, 4], or beyond an edge of its image."""
+    centre = points.mean(dim=0)
+    radius = 1.001 * float((points - centre).norm(dim=1).max()) + 1e-3  # what rounding might do is seen
+    x, y, z = (T_cam_world[:, :, :3] @ centre + T_cam_world[:, :, 3]).unbind(1)
+    seen = z > -radius
+    for across, focal, pixels in (
+        (x, camera.fx, camera.cx), (-x, camera.fx, camera.width - camera.cx),
+        (y, camera.fy, camera.cy), (-y, camera.fy, camera.height - camera.cy),
+    ):  # fmt: skip
+        seen &= focal * across + pixels * z > -radius * math.hypot(focal, pixels)
+    return seen
 
 
 def draw(window: Sequence[PosedView], config: KeyframeConfig, rng: np.random.Generator) -> PosedView:

@@ -324,6 +324,20 @@ def test_overlap_is_the_share_seen_inside_the_margin() -> None:
     assert overlaps(points, view.camera, [], 0) == []
 
 
+def test_keyframes_that_cannot_see_the_points_are_left_out_unseen() -> None:
+    """Of many places and directions the shares are those found point by point."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(50, 3, generator=generator) * torch.tensor([2.0, 1.0, 0.5]) + torch.tensor([3.0, -0.5, 2.0])
+    poses = [_at(12 * float(torch.rand((), generator=generator)) - 3, 0.05 * k) for k in range(200)]
+    shares = overlaps(points, CAMERA, [PosedView(_view(), T) for T in poses], 2)
+    for T, share in zip(poses, shares, strict=True):
+        x, y, z = (points @ T[:3, :3].T + T[:3, 3]).unbind(1)
+        u, v = CAMERA.fx * x / z + CAMERA.cx, CAMERA.fy * y / z + CAMERA.cy
+        inside = (z > 0) & (u > 2) & (u < 30) & (v > 2) & (v < 22)
+        assert share == pytest.approx(float(inside.float().mean()), abs=1e-6)
+    assert 20 < sum(share > 0 for share in shares) < 180
+
+
 def test_beyond_the_budget_the_keyframe_goes_that_its_neighbours_replace() -> None:
     """A camera that rests fills no memory, and what it saw on its way stays; the last frame is always there."""
     store = KeyframeStore(torch.device('cpu'), KeyframeConfig(budget=6))
