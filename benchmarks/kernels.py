@@ -17,6 +17,7 @@ import argparse
 import itertools
 import math
 import statistics
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -173,6 +174,14 @@ def print_roofline() -> None:
             print(f'| {threads} | {best} | {cam.width}x{cam.height} | {cells[0]} | {cells[1]} |', flush=True)
 
 
+def native() -> Iterator[tuple[str, CpuRasterizer, PinholeCamera, int]]:
+    """The native kernels: name, rasterizer, camera and threads of each line."""
+    for size, threads in itertools.product(SIZES, (1, 2)):
+        rasterizer = CpuRasterizer(threads)
+        name = f'cpu, {rasterizer.instruction_set}, {threads} thread{"s"[: threads - 1]}'
+        yield name, rasterizer, camera(*size), threads
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -182,22 +191,16 @@ def main() -> None:
     print_header('Rasterizer kernels', runs)
     print('| backend | image | forward ms | backward, map ms | backward, pose ms | forward + backward, map ms |')
     print('|---|---|---|---|---|---|')
-    for size in SIZES:
-        for threads in (1, 2):
-            rasterizer = CpuRasterizer(threads)
-            name = f'cpu, {rasterizer.instruction_set}, {threads} thread{"s"[: threads - 1]}'
-            row(name, rasterizer, camera(*size), runs)
-            row(f'{name}, anisotropic', rasterizer, camera(*size), runs, anisotropic=True)
+    for name, rasterizer, cam, _ in native():
+        row(name, rasterizer, cam, runs)
+        row(f'{name}, anisotropic', rasterizer, cam, runs, anisotropic=True)
     small = camera(64, 48)
     for name in ('cpu', 'reference'):
         row(f'{name}, 1 thread', make_rasterizer(name, 1), small, runs)
     print('\n| backend | image | alignment of a frame, ms | step of fused fitting, ms |')
     print('|---|---|---|---|')
-    for size in SIZES:
-        for threads in (1, 2):
-            rasterizer = CpuRasterizer(threads)
-            name = f'cpu, {rasterizer.instruction_set}, {threads} thread{"s"[: threads - 1]}'
-            realtime_row(name, rasterizer, camera(*size), runs, threads)
+    for name, rasterizer, cam, threads in native():
+        realtime_row(name, rasterizer, cam, runs, threads)
     for name in ('cpu', 'reference'):
         realtime_row(f'{name}, 1 thread', make_rasterizer(name, 1), small, runs, 1)
     print_roofline()
