@@ -108,7 +108,7 @@ setup(
     ext_modules=[native_extension()],
     cmdclass={'build_ext': BuildNative},
     data_files=shared_files(),
-    package_data={'splatam_core.evaluation': ['*.html']},
+    package_data={'splatam_core.evaluation.report': ['*.html']},
     python_requires='>=3.10',
     install_requires=[
         'matplotlib>=3.6',
@@ -125,7 +125,10 @@ setup(
         'mesh': ['open3d>=0.18'],
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
-            'pytest>=7', 'hypothesis>=6', 'OpenEXR>=3.3', 'pytorch-msssim>=1.0',
+            'pytest>=7',
+            'hypothesis>=6',
+            'OpenEXR>=3.3',
+            'pytorch-msssim>=1.0',
             f'triton>=3.4; {HAS_TRITON_WHEEL}',  # interprets the GPU's kernels; torch's CUDA builds bring their own
         ],
     },

@@ -21,8 +21,8 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from splatam_core.datasets.rosbag import DEPTH_TOPIC, INFO_TOPIC, RGB_TOPIC
+from splatam_ros.player.recording import Recording, stamp_of
 from splatam_ros.process import StopRequest, ros
-from splatam_ros.recording import Recording, stamp_of
 
 TOPICS = (INFO_TOPIC, RGB_TOPIC, DEPTH_TOPIC)
 AS_DRIVERS_DO = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
@@ -51,9 +51,7 @@ def due_times(rate_hz: float) -> Iterator[float]:
         due_s = max(due_s + 1 / rate_hz, time.monotonic())
 
 
-def publish(
-    publishers: dict[str, Publisher], frames: list[Frame], args: argparse.Namespace, stop: StopRequest
-) -> Iterator[str]:
+def publish(publishers: dict[str, Publisher], frames: list[Frame], args: argparse.Namespace, stop: StopRequest) -> Iterator[str]:
     """Publish; yields the lines of the log."""
     count = args.frames or len(frames)
     for frame, due_s in zip(islice(cycle(frames), count), due_times(args.rate)):
@@ -81,10 +79,7 @@ def main() -> None:
     with Recording(args.bag) as recording, StopRequest() as stop, ros(()):
         frames = frames_of(recording)
         node = rclpy.create_node('camera')
-        publishers = {
-            topic: node.create_publisher(recording.topics[topic].message_class, topic, AS_DRIVERS_DO)
-            for topic in TOPICS
-        }
+        publishers = {topic: node.create_publisher(recording.topics[topic].message_class, topic, AS_DRIVERS_DO) for topic in TOPICS}
         deadline_s = time.monotonic() + DISCOVERY_S
         while not (stop.requested or all(item.get_subscription_count() for item in publishers.values())):
             if time.monotonic() > deadline_s:

@@ -21,10 +21,8 @@ from header import print_header
 
 from splatam_core.commands.shared import open_source
 from splatam_core.evaluation.score import score_trajectory
-from splatam_core.evaluation.trajectory import interpolate_poses
-from splatam_core.run_folder import read_run
-from splatam_core.trajectory import pose_line
-from splatam_core.types import Trajectory
+from splatam_core.geometry.trajectory import Trajectory, interpolate_poses, pose_line
+from splatam_core.runs.run_folder import read_run
 
 COLUMNS = '| | ours | evo | difference |'
 

@@ -29,11 +29,11 @@ from kernels import camera, with_gradients
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatam_core import se3
-from splatam_core.camera import PinholeCamera
 from splatam_core.config import apply_threads, load_config
 from splatam_core.datasets import open_sequence
 from splatam_core.evaluation.images import ViewScorer
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.rasterizer import Gaussians, make_rasterizer
 from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame, Status

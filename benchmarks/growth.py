@@ -16,9 +16,10 @@ import numpy as np
 from header import print_header
 from numpy.typing import NDArray
 
-from splatam_core import environment, se3
-from splatam_core.camera import PinholeCamera
 from splatam_core.config import apply_threads, load_config
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.runs import provenance
 from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame
 
@@ -97,7 +98,7 @@ def main() -> None:
         poses = [(r.index, r.T_world_cam) for r in results if r.T_world_cam is not None]
         error = np.linalg.norm((T_world_start @ poses[-1][1])[:3, 3] - pose(poses[-1][0])[:3, 3]) if poses else np.nan
         print(f'| {begin}–{begin + len(times)} | {means[-1]:.1f} | {statistics.median(times):.1f} | '
-              f'{np.percentile(times, 95):.1f} | {slam.num_gaussians} | {environment.peak_rss_mb():.0f} | {100 * error:.1f} | '
+              f'{np.percentile(times, 95):.1f} | {slam.num_gaussians} | {provenance.peak_rss_mb():.0f} | {100 * error:.1f} | '
               f'{len(results) - len(poses)} |', flush=True)  # fmt: skip
     if len(means) > 2:
         print(f'\nLast window to frames 200–300: {means[-1] / means[2]:.2f}.')

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from splatam_core import environment
+from splatam_core.runs import provenance
 
 CALIBRATION_RUNS = 7
 
@@ -37,11 +37,11 @@ def calibration_ms() -> float:
 
 def print_header(title: str, runs: int) -> None:
     """Commit, machine, calibration and number of runs, as Markdown."""
-    machine = environment.machine()
+    machine = provenance.machine()
     print(f'### {title}\n')
     print(
-        f'Commit `{(environment.commit() or "unknown")[:18]}`; {machine["processor"]}, {machine["cores"]} cores, '
-        f'{machine["memory_mb"] // 1024} GB; {", ".join(f"{k} {v}" for k, v in environment.versions().items())}; '
+        f'Commit `{(provenance.commit() or "unknown")[:18]}`; {machine["processor"]}, {machine["cores"]} cores, '
+        f'{machine["memory_mb"] // 1024} GB; {", ".join(f"{k} {v}" for k, v in provenance.versions().items())}; '
         f'calibration kernel {calibration_ms():.1f} ms; runs: {runs}.\n',
         flush=True,
     )

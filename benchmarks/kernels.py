@@ -23,15 +23,15 @@ from dataclasses import dataclass, replace
 import torch
 from header import print_header, timed_ms
 
-from splatam_core import mapping
-from splatam_core.camera import PinholeCamera
 from splatam_core.config import load_config
-from splatam_core.gaussian_map import GaussianMap
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.images.view import View
+from splatam_core.mapping import optimizers
+from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.rasterizer import Gaussians, Rasterizer, Render, Target, make_rasterizer
 from splatam_core.rasterizer.base import BLUR_PX2, MIN_ALPHA
 from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.tracking import make_tracker
-from splatam_core.view import View
 
 SIZES = ((320, 240), (640, 480))
 TILE = 8
@@ -114,7 +114,7 @@ def realtime_row(name: str, rasterizer: Rasterizer, cam: PinholeCamera, runs: in
     still = wavy_wall(cam)
     times = [
         timed_ms(lambda: tracker.track(view, still, pose.double().numpy()), runs),
-        timed_ms(lambda: rasterizer.fit(wall.gaussians, wall.moments, mapping.rates(config.mapping), target), runs),
+        timed_ms(lambda: rasterizer.fit(wall.gaussians, wall.moments, optimizers.rates(config.mapping), target), runs),
     ]
     cells = (f'{statistics.median(ms):.1f} ({min(ms):.1f}-{max(ms):.1f})' for ms in times)
     print(f'| {name} | {cam.width}x{cam.height} | ' + ' | '.join(cells) + ' |', flush=True)

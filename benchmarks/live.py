@@ -19,8 +19,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from splatam_ros.demo import graph_environment
+from splatam_ros.player.recording import stamp_of
 from splatam_ros.process import ros
-from splatam_ros.recording import stamp_of
 
 HERE = Path(__file__).parent
 STOP_TIMEOUT_S = 60.0
@@ -108,11 +108,11 @@ class Graph:
         """Start the SLAM node; ``a__b`` stands for the parameter ``a.b``."""
         values = {'preset': preset, **{name.replace('__', '.'): value for name, value in parameters.items()}}
         words = [word for name, value in values.items() for word in ('-p', f'{name}:={value}')]
-        return self.start('-m', 'splatam_ros.main', '--ros-args', *words)
+        return self.start('-m', 'splatam_ros.node.main', '--ros-args', *words)
 
     def start_player(self, bag: Path, *options: str) -> Child:
         """Start the player."""
-        return self.start('-m', 'splatam_ros.bag_player', str(bag), *options)
+        return self.start('-m', 'splatam_ros.player.main', str(bag), *options)
 
     def start_camera(self, bag: Path, log: Path, *options: str) -> Child:
         """Start the camera of ``camera.py``."""

@@ -89,11 +89,7 @@ def row(number: int, run: Run) -> str:
     """A line of the table."""
     if not run.published:
         sys.exit('the recording was over before the first pose came: choose a longer one')
-    median, p95 = (
-        (statistics.median(run.latency_ms), float(np.percentile(run.latency_ms, 95)))
-        if run.latency_ms
-        else 2 * (np.nan,)
-    )
+    median, p95 = (statistics.median(run.latency_ms), float(np.percentile(run.latency_ms, 95))) if run.latency_ms else 2 * (np.nan,)
     dropped = 100 * (1 - run.processed / run.published)
     return (
         f'| {number} | {median:.0f} | {p95:.0f} | {run.early} | {run.published} | {dropped:.1f} | {run.processed - run.tracked} '

@@ -77,10 +77,7 @@ def main() -> None:
     print('|' + '---|' * len(COLUMNS))
     for run, name in (('node', 'node, 1 thread'), ('offline', 'offline, 1 thread'), ('all_cores', 'offline, all cores')):
         print(table_row(name, out / run))
-    same = [
-        (out / 'node' / name).read_bytes() == (out / 'offline' / name).read_bytes()
-        for name in ('trajectory.txt', 'map.ply')
-    ]
+    same = [(out / 'node' / name).read_bytes() == (out / 'offline' / name).read_bytes() for name in ('trajectory.txt', 'map.ply')]
     print(f'\nNode and offline bit-identical: poses {"yes" if same[0] else "NO"}, map {"yes" if same[1] else "NO"}.')
 
 

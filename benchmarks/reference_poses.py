@@ -17,12 +17,13 @@ import numpy as np
 from header import print_header
 from numpy.typing import NDArray
 
-from splatam_core import se3
 from splatam_core.config import apply_threads, load_config
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.evaluation.trajectory import trajectory_error
+from splatam_core.geometry import se3
+from splatam_core.geometry.trajectory import Trajectory
 from splatam_core.slam import Slam
-from splatam_core.types import RgbdFrame, Trajectory
+from splatam_core.types import RgbdFrame
 
 NEIGHBOURS = 5
 

@@ -13,10 +13,10 @@ from header import print_header
 
 from splatam_core.config import apply_threads, load_config
 from splatam_core.datasets import open_sequence
+from splatam_core.images.view import View
 from splatam_core.rasterizer import make_rasterizer
 from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame
-from splatam_core.view import View
 
 
 def bias_mm(frame: RgbdFrame, settle: int, steps: int) -> float:

@@ -27,14 +27,15 @@ import numpy as np
 from header import print_header
 from numpy.typing import NDArray
 
-from splatam_core import environment
 from splatam_core.config import apply_threads, load_config
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.evaluation.images import ViewScorer, mean_scores
 from splatam_core.evaluation.trajectory import trajectory_error
+from splatam_core.geometry.trajectory import Trajectory
 from splatam_core.rasterizer import rasterizer_for
+from splatam_core.runs import provenance
 from splatam_core.slam import Slam
-from splatam_core.types import RgbdFrame, StageTimings, Trajectory
+from splatam_core.types import RgbdFrame, StageTimings
 
 Poses = list[NDArray[np.float64] | None]
 SCORED_EVERY = 7  # no multiple of the keyframes' distance: those the map knows better
@@ -126,7 +127,7 @@ def run_one(system: SimpleNamespace, source: str, width: int, seed: int) -> Outc
         poses, seconds = run_opencv(frames)
     else:
         poses, seconds, slam, stages_ms = run_ours(frames, system.name, [f'seed={seed}', *system.overrides])
-    peak = environment.peak_rss_mb()
+    peak = provenance.peak_rss_mb()
     tracked = [(frame, pose) for frame, pose in zip(frames, poses) if pose is not None]
     estimate = Trajectory(np.array([f.stamp_ns for f, _ in tracked]), np.array([pose for _, pose in tracked]))
     truth = sequence.ground_truth()

@@ -63,9 +63,7 @@ def parameters(message: Any, *, is_rectified: bool = False) -> CameraParameters:
     """
     fx, cx, fy, cy = _intrinsics('P', message.p, 4) if is_rectified else _intrinsics('K', message.k, 3)
     model, coefficients = ('none', ()) if is_rectified else _distortion(message)
-    full = CameraParameters(
-        int(message.width), int(message.height), fx, fy, cx, cy, model, coefficients, message.header.frame_id
-    )
+    full = CameraParameters(int(message.width), int(message.height), fx, fy, cx, cy, model, coefficients, message.header.frame_id)
     if full.width < 1 or full.height < 1:
         raise MessageError(f'CameraInfo says the image is {full.width}x{full.height}; fill in width and height')
     return _binned(_cropped(full, message.roi), int(message.binning_x), int(message.binning_y))
@@ -129,9 +127,7 @@ def info_message(factory: MessageFactory, camera: CameraParameters, stamp_ns: in
     """
     is_distorted = camera.distortion_model != 'none'
     k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1], dtype=np.float64)
-    roi = factory.make(
-        'sensor_msgs/msg/RegionOfInterest', x_offset=0, y_offset=0, width=0, height=0, do_rectify=False
-    )
+    roi = factory.make('sensor_msgs/msg/RegionOfInterest', x_offset=0, y_offset=0, width=0, height=0, do_rectify=False)
     return factory.make(
         'sensor_msgs/msg/CameraInfo',
         header=stamps.header(factory, stamp_ns, camera.frame_id),

@@ -96,8 +96,7 @@ def decode(message: Any, encodings: Mapping[str, Encoding], what: str) -> NDArra
     encoding = encodings.get(message.encoding)
     if encoding is None:
         raise MessageError(
-            f"{what} image has encoding '{message.encoding}'; supported are {', '.join(encodings)}; "
-            f'is this the {what} topic?'
+            f"{what} image has encoding '{message.encoding}'; supported are {', '.join(encodings)}; is this the {what} topic?"
         )
     return encoding.convert(_pixels(message, encoding))
 

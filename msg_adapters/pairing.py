@@ -25,9 +25,7 @@ class _Verdict(Enum):
     WAIT = auto()
 
 
-def first_pair(
-    color: Sequence[Key], depth: Sequence[Key], max_interval_ns: int, is_final: bool = False
-) -> tuple[Key, Key] | None:
+def first_pair(color: Sequence[Key], depth: Sequence[Key], max_interval_ns: int, is_final: bool = False) -> tuple[Key, Key] | None:
     """The earliest colour and depth that belong together, as far as can be known.
 
     A pair is at most ``max_interval_ns`` apart, and neither a message between the two nor the next one of the

@@ -65,9 +65,7 @@ def cloud_message(
     )
 
 
-def _packed(
-    points: NDArray[np.float32], rgb: NDArray[np.uint8], extra: Sequence[NDArray[np.float32]]
-) -> NDArray[np.uint8]:
+def _packed(points: NDArray[np.float32], rgb: NDArray[np.uint8], extra: Sequence[NDArray[np.float32]]) -> NDArray[np.uint8]:
     data = np.zeros((len(points), 4 * (len(_FIELDS) + len(extra))), np.uint8)
     data[:, :12].view('<f4')[:] = points
     data[:, 12:15] = rgb[:, ::-1]

@@ -49,9 +49,7 @@ def _matrix(what: str, p: Any, q: Any) -> Matrix:
 
 def pose_message(factory: MessageFactory, T: Matrix) -> Any:
     """A ``geometry_msgs/Pose`` of a [4, 4] rigid motion; the quaternion has w >= 0."""
-    return factory.make(
-        'geometry_msgs/msg/Pose', position=_xyz(factory, 'Point', T[:3, 3]), orientation=_quaternion(factory, T)
-    )
+    return factory.make('geometry_msgs/msg/Pose', position=_xyz(factory, 'Point', T[:3, 3]), orientation=_quaternion(factory, T))
 
 
 def pose_stamped(factory: MessageFactory, T: Matrix, stamp_ns: int, frame_id: str) -> Any:

@@ -185,9 +185,7 @@ class RgbdSynchronizer:
         self._epoch = color.epoch
         self._clock.close_before(color.epoch)
         self._gap_ns = depth.stamp_ns - color.stamp_ns
-        self._pairs.append(
-            _Pair(color.stamp_ns, self._color.take(color), self._depth.take(depth), self._resets, self._gap_ns)
-        )
+        self._pairs.append(_Pair(color.stamp_ns, self._color.take(color), self._depth.take(depth), self._resets, self._gap_ns))
 
     def _release(self) -> list[RgbdSet]:
         if not self._infos.is_known:

@@ -30,8 +30,8 @@ from splatam_core.errors import DatasetError, FrameError, RunFolderError, Splata
 # Whatever takes time to import (torch, OpenCV, matplotlib) is imported by the command that needs it.
 if TYPE_CHECKING:
     from splatam_core.datasets.base import Sequence as FrameSequence
-    from splatam_core.resuming import CheckpointWriter
-    from splatam_core.run_folder import RunFolder
+    from splatam_core.runs.resume import CheckpointWriter
+    from splatam_core.runs.run_folder import RunFolder
     from splatam_core.slam import Slam
 
 EXIT_ERROR = 2
@@ -82,9 +82,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--checkpoint-every', type=positive, metavar='N', help='save all that --resume needs after every n-th frame'
     )
-    parser.add_argument(
-        '--keep-checkpoints', type=positive, metavar='K', help='remove all but the last K checkpoints (default: 2)'
-    )
+    parser.add_argument('--keep-checkpoints', type=positive, metavar='K', help='remove all but the last K checkpoints (default: 2)')
     parser.add_argument(
         '--resume', type=Path, metavar='DIR', help='go on from the last checkpoint of the run in DIR, to the same result'
     )
@@ -93,7 +91,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """``splatam run``: SLAM over a recording, from its beginning or from a checkpoint."""
-    from splatam_core.run_folder import read_run
+    from splatam_core.runs.run_folder import read_run
 
     job = _begin(args) if args.resume is None else _resume(args)
     path, length = job.folder.path, len(job.sequence)
@@ -144,9 +142,9 @@ class _Job:
 
 def _begin(args: argparse.Namespace) -> _Job:
     from splatam_core.config import apply_threads, load_config
-    from splatam_core.offline import prepare
-    from splatam_core.resuming import CheckpointWriter
-    from splatam_core.run_folder import KEEP_CHECKPOINTS, RunDescription, RunFolder
+    from splatam_core.runs.offline import prepare
+    from splatam_core.runs.resume import CheckpointWriter
+    from splatam_core.runs.run_folder import KEEP_CHECKPOINTS, RunDescription, RunFolder
 
     if args.source is None or args.out is None:
         make_parser().error('run needs SOURCE and --out DIR, or --resume DIR to go on with one')
@@ -164,7 +162,7 @@ def _begin(args: argparse.Namespace) -> _Job:
 
 def _resume(args: argparse.Namespace) -> _Job:
     from splatam_core.config import apply_threads
-    from splatam_core.resuming import CheckpointWriter, resume
+    from splatam_core.runs.resume import CheckpointWriter, resume
 
     _check_is_all(args)
     run = resume(args.resume, open_source, apply_threads, say, args.device)
@@ -193,8 +191,8 @@ def _check_is_all(args: argparse.Namespace) -> None:
 
 
 def _resume_hint(path: Path) -> str:
-    from splatam_core.checkpoints import checkpoint_paths
-    from splatam_core.run_folder import CHECKPOINTS
+    from splatam_core.runs.checkpoints import checkpoint_paths
+    from splatam_core.runs.run_folder import CHECKPOINTS
 
     return f"; 'splatam run --resume {path}' goes on" if checkpoint_paths(path / CHECKPOINTS) else ''
 
@@ -210,9 +208,7 @@ class _StopRequest:
         self._previous = signal.signal(signal.SIGINT, self._request)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
         signal.signal(signal.SIGINT, self._previous)
 
     def _request(self, number: int, frame: FrameType | None) -> None:

@@ -106,7 +106,7 @@ class TrackingConfig:
     method: str = _setting(
         'render_and_compare',
         "The paper's Adam through the renderer, Gauss-Newton alignment to one render, the expected pose as it is, or the "
-        "true one (of recordings that have it).",
+        'true one (of recordings that have it).',
         choices=('render_and_compare', 'align', 'none', 'truth'),
     )
     iterations: int = _setting(40, 'Steps per frame; of alignment, at most per resolution.', '', 0)
@@ -135,9 +135,7 @@ class TrackingConfig:
     translation_rate: float = _setting(2e-3, 'Adam step of the translation.', 'm', 0.0)
     color_weight: float = _setting(0.5, 'Weight of the colour L1.', '', 0.0)
     depth_weight: float = _setting(1.0, 'Weight of the depth L1.', '', 0.0)
-    silhouette_threshold: float = _setting(
-        0.99, 'Pixels count only where the rendered silhouette is above this.', '', 0.0, 1.0
-    )
+    silhouette_threshold: float = _setting(0.99, 'Pixels count only where the rendered silhouette is above this.', '', 0.0, 1.0)
     use_silhouette: bool = _setting(
         True,
         "Of the paper's tracker: look at sure map only; off = depth where there is a reading and colour everywhere, "
@@ -150,12 +148,8 @@ class TrackingConfig:
         False, "Of the paper's tracker: compare the blended depth, short where the map is thin, as the original does, and not "
         'the expected one.',
     )  # fmt: skip
-    motion_model: str = _setting(
-        'constant_velocity', 'Where tracking starts from.', choices=('constant_velocity', 'last_pose')
-    )
-    min_sure_fraction: float = _setting(
-        0.2, 'Lost when a smaller share of the pixels with depth sees sure map.', '', 0.0, 1.0
-    )
+    motion_model: str = _setting('constant_velocity', 'Where tracking starts from.', choices=('constant_velocity', 'last_pose'))
+    min_sure_fraction: float = _setting(0.2, 'Lost when a smaller share of the pixels with depth sees sure map.', '', 0.0, 1.0)
     min_inlier_fraction: float = _setting(
         0.5, 'Lost when a smaller share of those pixels agrees with the map in depth and colour.', '', 0.0, 1.0
     )
@@ -178,9 +172,7 @@ class DensificationConfig:
         50.0, 'Also add where the reading is in front of the map by more than this many median errors.', '', 0.0
     )
     opacity: float = _setting(0.5, 'Opacity of a new Gaussian.', '', 0.01, 0.99)
-    settle: int = _setting(
-        0, 'Rounds that move new Gaussians along their rays until the rendered depth meets the reading.', '', 0
-    )
+    settle: int = _setting(0, 'Rounds that move new Gaussians along their rays until the rendered depth meets the reading.', '', 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,9 +283,7 @@ class SlamConfig:
     """Everything that can be set about SLAM. The defaults are the paper's for Replica."""
 
     seed: int = _setting(0, 'Seed of every random choice.', '', 0)
-    width: int = _setting(
-        0, "Of 'splatam run' without --width: wider frames are resized to this width; 0 = as recorded.", 'px', 0
-    )
+    width: int = _setting(0, "Of 'splatam run' without --width: wider frames are resized to this width; 0 = as recorded.", 'px', 0)
     threads: int = _setting(0, 'CPU threads; 0 = all cores, 1 = repeatable bit for bit.', '', 0, 256)
     device: str = _setting(
         'auto', 'Where maps live and are computed; auto = on a GPU where torch sees one and triton is there, else cpu.',

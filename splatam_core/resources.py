@@ -26,6 +26,4 @@ def config_dir() -> Path:
         installed = prefix / 'share' / _PACKAGE / 'config'
         if installed.is_dir():
             return installed
-    raise ConfigError(
-        f'no share/{_PACKAGE}/config above {here.parent}: the installation is incomplete; install {_PACKAGE} again'
-    )
+    raise ConfigError(f'no share/{_PACKAGE}/config above {here.parent}: the installation is incomplete; install {_PACKAGE} again')

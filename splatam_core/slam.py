@@ -9,20 +9,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatam_core import se3
-from splatam_core.backend import choose_backend, pose_tensor
-from splatam_core.camera import PinholeCamera
-from splatam_core.checkpoints import SlamState
 from splatam_core.config import SlamConfig
+from splatam_core.device import choose_backend, pose_tensor
 from splatam_core.errors import ConfigError, FrameError, SplatamError
-from splatam_core.gaussian_map import GaussianMap
-from splatam_core.mapper import Mapper
-from splatam_core.motion import MotionModel, MotionPrior
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.images.view import View
+from splatam_core.mapping.gaussian_map import GaussianMap
+from splatam_core.mapping.mapper import Mapper
 from splatam_core.rasterizer import Gaussians, make_rasterizer
+from splatam_core.state import SlamState
 from splatam_core.stopwatch import Stopwatch
 from splatam_core.tracking import make_tracker
+from splatam_core.tracking.motion import MotionModel, MotionPrior
 from splatam_core.types import FrameResult, MapSnapshot, RenderedView, RgbdFrame, Status
-from splatam_core.view import View
 
 Matrix = NDArray[np.float64]
 
@@ -192,8 +192,7 @@ class Slam:
             raise FrameError(f'the camera changed from {self.camera} to {frame.camera}; reset to start a new map')
         if self._last_stamp_ns is not None and frame.stamp_ns <= self._last_stamp_ns:
             raise FrameError(
-                f'frame stamp {frame.stamp_ns} ns is not after the last one, {self._last_stamp_ns} ns; '
-                'reset to go back in time'
+                f'frame stamp {frame.stamp_ns} ns is not after the last one, {self._last_stamp_ns} ns; reset to go back in time'
             )
         self.camera = frame.camera
 

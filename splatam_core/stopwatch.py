@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import torch
 
-from splatam_core.backend import finish
+from splatam_core.device import synchronize
 from splatam_core.types import StageTimings
 
 
@@ -22,12 +22,12 @@ class Stopwatch:
 
     def lap(self, stage: str) -> None:
         """A stage has ended; the next begins."""
-        finish(self.device)
+        synchronize(self.device)
         now = time.perf_counter()
         self.laps[stage] = 1e3 * (now - self.lapped)
         self.lapped = now
 
     def timings(self) -> StageTimings:
         """All so far."""
-        finish(self.device)
+        synchronize(self.device)
         return StageTimings(**self.laps, total=1e3 * (time.perf_counter() - self.started))

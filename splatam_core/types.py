@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from splatam_core.camera import PinholeCamera
+    from splatam_core.geometry.camera import PinholeCamera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,17 +115,4 @@ class MapSnapshot:
     rotations: NDArray[np.float32] | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
-    """Camera poses over time.
-
-    Attributes:
-        stamps_ns: [N] int64, increasing.
-        T_world_cam: [N, 4, 4] float64, camera to world.
-    """
-
-    stamps_ns: NDArray[np.int64]
-    T_world_cam: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.stamps_ns)
+Arrays = Mapping[str, NDArray[Any]]

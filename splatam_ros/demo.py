@@ -25,8 +25,8 @@ WIDTH = 320
 MARKER = '.demo'
 COMMANDS = {
     'splatam': 'splatam_core.cli',
-    'splatam_node': 'splatam_ros.main',
-    'splatam_bag_player': 'splatam_ros.bag_player',
+    'splatam_node': 'splatam_ros.node.main',
+    'splatam_bag_player': 'splatam_ros.player.main',
 }
 FINISH_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 20.0
@@ -71,9 +71,7 @@ class Processes:
     def __enter__(self) -> Processes:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
         running = [process for process in reversed(self._started) if process.poll() is None]
         for process in running:
             process.send_signal(signal.SIGINT)
@@ -189,9 +187,7 @@ def stop(number: int, frame: FrameType | None) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demo; returns the exit code."""
     parser = argparse.ArgumentParser('splatam_ros.demo', description='Play a recording into the node and score it.')
-    parser.add_argument(
-        'source', nargs='?', metavar='SOURCE', help='a rosbag2 or a dataset (default: a synthetic room)'
-    )
+    parser.add_argument('source', nargs='?', metavar='SOURCE', help='a rosbag2 or a dataset (default: a synthetic room)')
     parser.add_argument('--out', type=Path, default=Path('out/demo'), help='folder of the run (default: %(default)s)')
     args = parser.parse_args(arguments)
     for number in (signal.SIGINT, signal.SIGTERM):  # a shell's background jobs would ignore SIGINT

@@ -11,12 +11,12 @@ _EXIT_INTERRUPTED = 130  # as shells say it: 128 + SIGINT
 
 def node() -> int:
     """``splatam_node``."""
-    return _main('splatam_ros.main')
+    return _main('splatam_ros.node.main')
 
 
 def player() -> int:
     """``splatam_bag_player``."""
-    return _main('splatam_ros.bag_player')
+    return _main('splatam_ros.player.main')
 
 
 def _main(module: str) -> int:
@@ -26,8 +26,7 @@ def _main(module: str) -> int:
         if (error.name or '').split('.')[0] not in ('rclpy', 'rcl_interfaces', 'sensor_msgs'):
             raise
         print(
-            f"splatam_ros: no ROS 2 in this Python ({error}): pip install 'splatam_ros[ros]', or source "
-            '/opt/ros/jazzy/setup.bash',
+            f"splatam_ros: no ROS 2 in this Python ({error}): pip install 'splatam_ros[ros]', or source /opt/ros/jazzy/setup.bash",
             file=sys.stderr,
         )
         return _EXIT_USAGE

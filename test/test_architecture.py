@@ -16,8 +16,8 @@ PACKAGES = ('msg_adapters', 'splatam_core', 'splatam_ros')
 
 BAG_READER = 'splatam_core.datasets.rosbag'
 EXR_READER = 'splatam_core.datasets.files'
-TRITON = 'splatam_core.rasterizer.triton'  # and its kernels and lists, which only it imports
-OPTIONAL = {'lpips': 'splatam_core.evaluation.similarity', 'open3d': 'splatam_core.export'}
+TRITON = 'splatam_core.rasterizer.triton.rasterizer'  # and its kernels and lists, which only it imports
+OPTIONAL = {'lpips': 'splatam_core.evaluation.similarity', 'open3d': 'splatam_core.maps.export'}
 MESSAGES = {
     'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'rcl_interfaces', 'rosgraph_msgs',
     'sensor_msgs', 'std_msgs', 'std_srvs', 'tf2_msgs',
@@ -31,7 +31,7 @@ MAY_IMPORT = {
     },
 }  # fmt: skip
 THREADING = {'_thread', 'asyncio', 'concurrent', 'multiprocessing', 'threading'}
-MAY_THREAD = {'splatam_core.worker', 'splatam_ros.node', 'splatam_ros.read_ahead', 'splatam_ros.transforms'}
+MAY_THREAD = {'splatam_core.worker', 'splatam_ros.node.node', 'splatam_ros.player.read_ahead', 'splatam_ros.frames.buffer'}
 
 
 @dataclass(frozen=True)
@@ -135,11 +135,7 @@ def module_name(path: Path) -> str:
 
 
 def test_every_import_keeps_to_its_layer() -> None:
-    found = [
-        line
-        for path in source_files()
-        for line in breaches(module_name(path), path.read_text(), path.name == '__init__.py')
-    ]
+    found = [line for path in source_files() for line in breaches(module_name(path), path.read_text(), path.name == '__init__.py')]
     assert not found, '\n' + '\n'.join(found)
 
 
@@ -158,7 +154,7 @@ def test_every_import_keeps_to_its_layer() -> None:
         ('splatam_core.evaluation.similarity', 'import lpips'),
         ('splatam_core.slam', 'def f():\n    import open3d'),
         ('splatam_core.slam', 'import triton'),
-        ('splatam_core.slam', 'from splatam_core.rasterizer.triton import TritonRasterizer'),
+        ('splatam_core.slam', 'from splatam_core.rasterizer.triton.rasterizer import TritonRasterizer'),
         ('splatam_core.slam', 'from splatam_ros import node'),
         ('splatam_core.slam', 'from ..splatam_ros import node'),
         ('splatam_core.slam', "import importlib\nimportlib.import_module('rclpy')"),
@@ -173,9 +169,9 @@ def test_every_import_keeps_to_its_layer() -> None:
         ('msg_adapters.synchronizer', 'def f():\n    import rclpy'),
         ('msg_adapters.synchronizer', 'if TYPE_CHECKING:\n    from splatam_core.types import RgbdFrame'),
         ('msg_adapters.synchronizer', 'import threading'),
-        ('splatam_ros.outputs', 'import threading'),
-        ('splatam_ros.outputs', 'import cv_bridge'),
-        ('splatam_ros.outputs', 'from tf2_ros import TransformBroadcaster'),
+        ('splatam_ros.node.outputs', 'import threading'),
+        ('splatam_ros.node.outputs', 'import cv_bridge'),
+        ('splatam_ros.node.outputs', 'from tf2_ros import TransformBroadcaster'),
     ],
 )
 def test_a_breach_is_seen(module: str, source: str) -> None:
@@ -187,13 +183,13 @@ def test_a_breach_is_seen(module: str, source: str) -> None:
     [
         ('splatam_core.datasets.rosbag', 'from msg_adapters import images\nfrom rosbags.rosbag2 import Reader'),
         ('splatam_core.slam', 'from . import se3\nfrom .rasterizer.base import Render'),
-        ('splatam_core.rasterizer', 'def f():\n    from splatam_core.rasterizer.triton import TritonRasterizer'),
-        ('splatam_core.rasterizer.triton_lists', 'import triton\nfrom splatam_core.rasterizer import triton_kernels'),
+        ('splatam_core.rasterizer', 'def f():\n    from splatam_core.rasterizer.triton.rasterizer import TritonRasterizer'),
+        ('splatam_core.rasterizer.triton.lists', 'import triton\nfrom splatam_core.rasterizer import triton_kernels'),
         ('splatam_core.worker', 'import threading'),
         ('splatam_core.datasets.files', 'def f():\n    import OpenEXR'),
-        ('splatam_core.export', 'def f():\n    import open3d'),
+        ('splatam_core.maps.export', 'def f():\n    import open3d'),
         ('msg_adapters.factory', 'def f():\n    from sensor_msgs.msg import Image'),
-        ('splatam_ros.node', 'import rclpy, threading\nfrom splatam_core.worker import SlamWorker'),
+        ('splatam_ros.node.node', 'import rclpy, threading\nfrom splatam_core.worker import SlamWorker'),
     ],
 )
 def test_what_is_allowed_stays_allowed(module: str, source: str) -> None:

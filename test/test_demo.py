@@ -90,12 +90,12 @@ def test_a_step_that_fails_is_named(out: Path) -> None:
 
 def test_a_node_that_dies_ends_the_demo_with_its_last_words(out: Path) -> None:
     process = start_demo(out, 'synthetic:frames=30')
-    wait_until(lambda: any('splatam_ros.bag_player' in command for command in alive(out)))
+    wait_until(lambda: any('splatam_ros.player.main' in command for command in alive(out)))
     wait_until(lambda: (out / 'trajectory.txt').is_file())
     node = next(
         int(path.parent.name)
         for path in Path('/proc').glob('[0-9]*/cmdline')
-        if f'save_path:={out}'.encode() in path.read_bytes() and b'splatam_ros.main' in path.read_bytes()
+        if f'save_path:={out}'.encode() in path.read_bytes() and b'splatam_ros.node.main' in path.read_bytes()
     )
     os.kill(node, signal.SIGKILL)
     said, _ = process.communicate(timeout=TIMEOUT_S)

@@ -35,9 +35,7 @@ def canonical(requirement: str) -> str:
 
 def files_below(folder: Path, pattern: str = '*') -> set[Path]:
     """Files by their path relative to the folder, without caches."""
-    return {
-        path.relative_to(folder) for path in folder.rglob(pattern) if path.is_file() and '__pycache__' not in path.parts
-    }
+    return {path.relative_to(folder) for path in folder.rglob(pattern) if path.is_file() and '__pycache__' not in path.parts}
 
 
 def test_the_version_is_stated_once_and_is_the_installed_one() -> None:
@@ -48,9 +46,7 @@ def test_the_version_is_stated_once_and_is_the_installed_one() -> None:
 
 
 def test_the_commands_can_be_loaded() -> None:
-    commands = {
-        entry.name: entry for entry in metadata.distribution(NAME).entry_points if entry.group == 'console_scripts'
-    }
+    commands = {entry.name: entry for entry in metadata.distribution(NAME).entry_points if entry.group == 'console_scripts'}
     assert commands.keys() == {'splatam', 'splatam_node', 'splatam_bag_player'}
     assert all(callable(entry.load()) for entry in commands.values())
 

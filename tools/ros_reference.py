@@ -20,9 +20,9 @@ import yaml
 from splatam_core.config import Setting
 from splatam_ros import interface
 from splatam_ros.cameras import CAMERAS
-from splatam_ros.outputs import OUTPUTS
-from splatam_ros.parameters import NODE_SETTINGS, why_fixed
-from splatam_ros.services import SERVICES
+from splatam_ros.node.outputs import OUTPUTS
+from splatam_ros.node.parameters import NODE_SETTINGS, why_fixed
+from splatam_ros.node.services import SERVICES
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / 'docs' / 'ros.md'
@@ -39,9 +39,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def inputs() -> str:
     """What the node subscribes to."""
-    return table(
-        ('topic', 'type', ''), ((f'`{topic.name}`', topic.type_name, topic.help) for topic in interface.INPUTS)
-    )
+    return table(('topic', 'type', ''), ((f'`{topic.name}`', topic.type_name, topic.help) for topic in interface.INPUTS))
 
 
 def outputs() -> str:

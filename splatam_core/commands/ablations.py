@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from splatam_core.commands.shared import Command, add_source_arguments, at_width, open_source, say, source_of, source_words
 
 if TYPE_CHECKING:
-    from splatam_core.run_folder import Source
+    from splatam_core.runs.run_folder import Source
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +22,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def ablations(args: argparse.Namespace) -> int:
     """Run the paper's ablations over a recording, one after another, and print their table."""
-    from splatam_core.ablations import provenance, run, table, variant_names, variants
+    from splatam_core.evaluation.ablations import provenance, run, table, variant_names, variants
 
     chosen = variants(args.only or variant_names(), args.preset, args.set)
     source = at_width(source_of(args), chosen[0].config)

@@ -14,9 +14,7 @@ from splatam_core.errors import RunFolderError
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_source_arguments(parser)
-    parser.add_argument(
-        '--presets', required=True, metavar='A,B', help='shipped presets or .yaml files, with commas between'
-    )
+    parser.add_argument('--presets', required=True, metavar='A,B', help='shipped presets or .yaml files, with commas between')
     parser.add_argument(
         '--set',
         action='append',
@@ -30,14 +28,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def bench(args: argparse.Namespace) -> int:
     """Run presets one after another, each in a process of its own, and compare them."""
     from splatam_core.config import load_config
-    from splatam_core.run_folder import check_is_free
+    from splatam_core.runs.run_folder import check_is_free
 
     presets = [preset.strip() for preset in args.presets.split(',') if preset.strip()]
     folders = [args.out / Path(preset).stem for preset in presets]
     if len(set(folders)) < len(folders) or not folders:
-        raise RunFolderError(
-            f"--presets {args.presets}: expected different presets with commas between, like 'quick,tum'"
-        )
+        raise RunFolderError(f"--presets {args.presets}: expected different presets with commas between, like 'quick,tum'")
     for preset in presets:
         load_config(preset, args.set)  # a wrong name is said now, not after an hour
     check_is_free(args.out)
@@ -53,9 +49,7 @@ def bench(args: argparse.Namespace) -> int:
             '--out',
             folder,
         ]
-        done = subprocess.run(
-            [*map(str, command), *(word for entry in args.set for word in ('--set', entry))], check=False
-        )
+        done = subprocess.run([*map(str, command), *(word for entry in args.set for word in ('--set', entry))], check=False)
         if done.returncode != 0:
             raise RunFolderError(f'preset {preset} ended with exit code {done.returncode}; see above')
     print()

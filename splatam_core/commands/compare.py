@@ -35,9 +35,9 @@ def compare_runs(folders: Sequence[Path], plot: Path) -> None:
     Raises:
         RunFolderError: one of them is no run, or the picture cannot be written.
     """
-    from splatam_core.evaluation.comparison import comparison_table, draw_comparison
-    from splatam_core.files import replaced
-    from splatam_core.run_folder import read_run
+    from splatam_core.atomic_io import replaced
+    from splatam_core.evaluation.report.comparison import comparison_table, draw_comparison
+    from splatam_core.runs.run_folder import read_run
 
     kind = plot.suffix.removeprefix('.').lower()
     if kind not in ('png', 'svg', 'pdf'):

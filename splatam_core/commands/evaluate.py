@@ -21,10 +21,10 @@ from splatam_core.errors import DatasetError, RunFolderError, SplatamError
 
 if TYPE_CHECKING:
     from splatam_core.datasets.base import Sequence
-    from splatam_core.evaluation.metrics import Metrics
     from splatam_core.evaluation.score import NovelViews
-    from splatam_core.run_folder import RunRecord
-    from splatam_core.types import Trajectory
+    from splatam_core.geometry.trajectory import Trajectory
+    from splatam_core.runs.metrics import Metrics
+    from splatam_core.runs.run_folder import RunRecord
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,9 +32,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--truth', metavar='FILE|BAG|DATASET', help="TUM trajectory, bag or dataset (default: the run's own source)"
     )
-    parser.add_argument(
-        '--every', type=positive, default=1, metavar='N', help='score the images of every n-th frame only'
-    )
+    parser.add_argument('--every', type=positive, default=1, metavar='N', help='score the images of every n-th frame only')
     parser.add_argument(
         '--novel-views', nargs='?', choices=('trajectory', 'first'), const='trajectory', metavar='ALIGNMENT',
         help="also score the test split of the run's dataset at its true poses, brought into the map by the alignment "
@@ -44,7 +42,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def evaluate(args: argparse.Namespace) -> int:
     """Score a run and draw its report."""
-    from splatam_core.run_folder import MAP
+    from splatam_core.runs.run_folder import MAP
 
     run = open_run(args.dir, args.device)
     truth, sequence = _truth_and_frames(run, args.truth)
@@ -60,12 +58,12 @@ def score(
     run: RunRecord, truth: Trajectory | None, sequence: Sequence | None, every: int, novel: NovelViews | None = None
 ) -> Metrics:
     """Score, then write ``metrics.json``, ``scores.csv`` and the reports; an error leaves them as they are."""
-    from splatam_core.evaluation.frame_table import write_frame_table
-    from splatam_core.evaluation.html import write_html
-    from splatam_core.evaluation.report import write_report
+    from splatam_core.atomic_io import replace_text
+    from splatam_core.evaluation.report.frame_table import write_frame_table
+    from splatam_core.evaluation.report.html import write_html
+    from splatam_core.evaluation.report.picture import write_report
     from splatam_core.evaluation.score import combine, score_images, score_trajectory
-    from splatam_core.files import replace_text
-    from splatam_core.run_folder import METRICS, PAGE, REPORT, SCORES
+    from splatam_core.runs.run_folder import METRICS, PAGE, REPORT, SCORES
 
     against_truth = None if truth is None else score_trajectory(run, truth)
     against_images = None if sequence is None else score_images(run, sequence, every, progress('scoring'))
@@ -88,8 +86,8 @@ def score_own_run(run: RunRecord, sequence: Sequence, every: int = 1) -> Metrics
 
 def _truth_and_frames(run: RunRecord, given: str | None) -> tuple[Trajectory | None, Sequence | None]:
     """What to score against. The run's own source shows the frames where it can be opened."""
-    from splatam_core.run_folder import Source
-    from splatam_core.trajectory import read_trajectory
+    from splatam_core.geometry.trajectory import read_trajectory
+    from splatam_core.runs.run_folder import Source
 
     if given is None:
         if run.description.source is None:
@@ -153,9 +151,7 @@ def print_summary(metrics: Metrics, folder: Path) -> None:
         rows.append(('held out', f'PSNR {scores}; {m.heldout_frames} frames kept out of the map'))
     if m.novel_alignment:
         scores = f'{_text(m.novel.psnr_db, 1, ".2f", "dB")}, depth L1 {_text(m.novel.depth_l1_m, 100, ".2f", "cm")}'
-        rows.append(
-            ('novel', f'PSNR {scores}; {m.novel_frames} views without holes, {m.novel_holes_frames} with apart')
-        )
+        rows.append(('novel', f'PSNR {scores}; {m.novel_frames} views without holes, {m.novel_holes_frames} with apart'))
     rows += [('Gaussians', _text(m.num_gaussians, 1, ',', '')), ('results', str(folder))]
     for name, value in rows:
         print(f'{name:<10} {value}'.rstrip())

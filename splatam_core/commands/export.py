@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from splatam_core.export import Surface
+    from splatam_core.maps.export import Surface
     from splatam_core.rasterizer import Gaussians
-    from splatam_core.run_folder import RunRecord
+    from splatam_core.runs.run_folder import RunRecord
 
 FORMS = ('gaussians', 'points', 'mesh', 'splatam')
 
@@ -36,9 +36,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='O',
         help='of points: leave out fainter ones (default: %(default)s)',
     )
-    parser.add_argument(
-        '--voxel', type=_number, default=0.01, metavar='M', help='of a mesh: metres (default: %(default)s)'
-    )
+    parser.add_argument('--voxel', type=_number, default=0.01, metavar='M', help='of a mesh: metres (default: %(default)s)')
     parser.add_argument(
         '--max-depth',
         type=_number,
@@ -60,8 +58,8 @@ def _number(text: str) -> float:
 
 def export(args: argparse.Namespace) -> int:
     """Write a run's map as a file for other programs."""
-    from splatam_core.export import centres
-    from splatam_core.ply import write_ply, write_surface
+    from splatam_core.maps.export import centres
+    from splatam_core.maps.ply import write_ply, write_surface
 
     suffix = '.npz' if args.form == 'splatam' else '.ply'
     if args.file.suffix.lower() != suffix:
@@ -89,7 +87,7 @@ def export(args: argparse.Namespace) -> int:
 
 
 def _mesh(args: argparse.Namespace, run: RunRecord, gaussians: Gaussians) -> Surface:
-    from splatam_core.export import fused_mesh
+    from splatam_core.maps.export import fused_mesh
     from splatam_core.rasterizer import rasterizer_for
 
     rasterizer, device = rasterizer_for(run.config)
@@ -102,8 +100,8 @@ def _mesh(args: argparse.Namespace, run: RunRecord, gaussians: Gaussians) -> Sur
 def _write_splatam(path: Path, run: RunRecord, gaussians: Gaussians) -> None:
     import numpy as np
 
-    from splatam_core.export import splatam_params
-    from splatam_core.files import replaced
+    from splatam_core.atomic_io import replaced
+    from splatam_core.maps.export import splatam_params
     from splatam_core.types import Status
 
     poses = run.trajectory.T_world_cam
@@ -118,7 +116,7 @@ def _true_poses(run: RunRecord) -> NDArray[np.float64]:
     """[T, 4, 4] T_world_cam of the tracked frames where the recording knows them; NaN elsewhere."""
     import numpy as np
 
-    from splatam_core.evaluation.trajectory import interpolate_poses
+    from splatam_core.geometry.trajectory import interpolate_poses
 
     source = run.description.source
     truth = None if source is None else open_source(source).ground_truth()

@@ -19,18 +19,16 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help='clone and split Gaussians where the image pulls at them, in the first half of the steps, as 3D Gaussian '
         'splatting does; of use from 1000 steps on',
     )  # fmt: skip
-    parser.add_argument(
-        '--every', type=positive, default=1, metavar='N', help='score every n-th frame only, before and after'
-    )
+    parser.add_argument('--every', type=positive, default=1, metavar='N', help='score every n-th frame only, before and after')
 
 
 def refine(args: argparse.Namespace) -> int:
     """Optimise a finished map over all frames of its run."""
     from splatam_core.evaluation.images import mean_scores
     from splatam_core.evaluation.score import score_images
+    from splatam_core.mapping.offline_refinement import refine_map
     from splatam_core.rasterizer import rasterizer_for
-    from splatam_core.refinement import refine_map
-    from splatam_core.run_folder import check_is_free, write_refined
+    from splatam_core.runs.run_folder import check_is_free, write_refined
 
     run = open_run(args.dir, args.device)
     rasterizer, device = rasterizer_for(run.config)

@@ -24,11 +24,11 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def render(args: argparse.Namespace) -> int:
     """Film a run's map along a path."""
-    from splatam_core.files import new_folder
+    from splatam_core.atomic_io import new_folder
+    from splatam_core.geometry.trajectory import read_trajectory
+    from splatam_core.maps.video import median_rate_hz, render_along
     from splatam_core.rasterizer import rasterizer_for
-    from splatam_core.renders import median_rate_hz, render_along
-    from splatam_core.run_folder import check_is_free
-    from splatam_core.trajectory import read_trajectory
+    from splatam_core.runs.run_folder import check_is_free
 
     if args.no_images and args.no_video:
         raise RunFolderError('--no-images and --no-video together leave nothing to write')

@@ -14,7 +14,7 @@ from splatam_core.config import DEVICES, computed_on
 if TYPE_CHECKING:
     from splatam_core.config import SlamConfig
     from splatam_core.datasets.base import Sequence
-    from splatam_core.run_folder import RunRecord, Source
+    from splatam_core.runs.run_folder import RunRecord, Source
 
 BAG_SUFFIXES = ('.db3', '.mcap', '.bag')
 
@@ -39,8 +39,10 @@ class Command:
 def add_source_arguments(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
     """SOURCE and how to read it."""
     parser.add_argument(
-        'source', metavar='SOURCE', nargs='?' if optional else None,
-        help='dataset folder, bag (folder, .db3, .mcap, ROS 1 .bag), synthetic[:seed=0,...]'
+        'source',
+        metavar='SOURCE',
+        nargs='?' if optional else None,
+        help='dataset folder, bag (folder, .db3, .mcap, ROS 1 .bag), synthetic[:seed=0,...]',
     )
     parser.add_argument('--format', metavar='F', help='reader to use (default: guessed from SOURCE)')
     parser.add_argument('--start', type=int, default=0, metavar='N', help='leave out the first N frames')
@@ -67,7 +69,7 @@ def add_device_argument(parser: argparse.ArgumentParser, help: str) -> None:
 
 def source_of(args: argparse.Namespace) -> Source:
     """The recording that the arguments name."""
-    from splatam_core.run_folder import Source
+    from splatam_core.runs.run_folder import Source
 
     path = str(Path(args.source).resolve()) if Path(args.source).exists() else args.source
     return Source(
@@ -133,7 +135,7 @@ def open_run(path: Path, device: str | None = None) -> RunRecord:
         RunFolderError: it is no run folder, or one of its files is damaged.
     """
     from splatam_core.config import apply_threads
-    from splatam_core.run_folder import read_run
+    from splatam_core.runs.run_folder import read_run
 
     run = read_run(path)
     run = replace(run, config=computed_on(run.config, device))

@@ -9,9 +9,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core.camera import PinholeCamera
 from splatam_core.errors import DatasetError, FrameError
-from splatam_core.types import RgbdFrame, Trajectory
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.geometry.trajectory import Trajectory
+from splatam_core.types import RgbdFrame
 
 FIRST_STAMP_NS = 1_000_000_000
 NOMINAL_RATE_HZ = 30

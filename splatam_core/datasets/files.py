@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core import se3
-from splatam_core.camera import CameraCalibration, CameraFile, PinholeCamera, read_camera_file
+from splatam_core.datasets.camera_file import CameraFile, read_camera_file
 from splatam_core.errors import CameraError, DatasetError
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 

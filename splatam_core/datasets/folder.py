@@ -32,11 +32,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core.camera import CameraCalibration, CameraFile, PinholeCamera
 from splatam_core.datasets import base, files
+from splatam_core.datasets.camera_file import CameraFile
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
 from splatam_core.errors import DatasetError
-from splatam_core.types import Trajectory
+from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
+from splatam_core.geometry.trajectory import Trajectory
 
 Poses = list[NDArray[np.float64] | None]
 
@@ -122,9 +123,7 @@ def _camera(folder: Path, color: Path) -> CameraFile:
     path = folder / name
     if name in JSON_FILES:
         return CameraFile(_open3d_calibration(path), DEPTH_SCALE)
-    return CameraFile(
-        files.calibration_from_matrix(files.read_matrix(path, 3, 4), files.image_size(color)), DEPTH_SCALE
-    )
+    return CameraFile(files.calibration_from_matrix(files.read_matrix(path, 3, 4), files.image_size(color)), DEPTH_SCALE)
 
 
 def _open3d_calibration(path: Path) -> CameraCalibration:

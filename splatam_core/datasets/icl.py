@@ -23,12 +23,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core import se3
-from splatam_core.camera import CameraCalibration, PinholeCamera
 from splatam_core.datasets import base, files
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
 from splatam_core.errors import DatasetError
-from splatam_core.types import Trajectory
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
+from splatam_core.geometry.trajectory import Trajectory
 
 CAMERA = CameraCalibration(PinholeCamera(640, 480, 481.2, 480.0, 319.5, 239.5))
 DEPTH_SCALE = 5000.0
@@ -50,9 +50,7 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
         poses = _poses(folder)
         return trajectory(pairs, [poses.get(number) for number in color])
 
-    return ImagePairs(
-        folder.resolve().name, pairs, camera.calibration, DepthFormat(camera.depth_scale), width=width, truth=truth
-    )
+    return ImagePairs(folder.resolve().name, pairs, camera.calibration, DepthFormat(camera.depth_scale), width=width, truth=truth)
 
 
 def _poses(folder: Path) -> dict[int, NDArray[np.float64]]:
@@ -64,9 +62,7 @@ def _poses(folder: Path) -> dict[int, NDArray[np.float64]]:
         return {}
     numbers = files.read_numbers(paths[0])
     if numbers.size % 8 or not np.isfinite(numbers).all():
-        raise DatasetError(
-            f"{paths[0]}: expected 'frame tx ty tz qx qy qz qw' in each line, got {numbers.size} numbers"
-        )
+        raise DatasetError(f"{paths[0]}: expected 'frame tx ty tz qx qy qz qw' in each line, got {numbers.size} numbers")
     rows = numbers.reshape(-1, 8)
     if not np.linalg.norm(rows[:, 4:], axis=1).all():
         raise DatasetError(f'{paths[0]}: a quaternion is zero')
@@ -84,6 +80,4 @@ def _open(source: str, options: base.ReadOptions) -> ImagePairs:
     return read(Path(source), width=options.width)
 
 
-FORMAT = base.Format(
-    'icl', 'a folder with rgb/, depth/, and associations.txt or a .gt.freiburg file', _recognises, _open
-)
+FORMAT = base.Format('icl', 'a folder with rgb/, depth/, and associations.txt or a .gt.freiburg file', _recognises, _open)

@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core.camera import CameraCalibration
 from splatam_core.datasets import base, files, nerfstudio
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
 from splatam_core.errors import DatasetError
+from splatam_core.geometry.camera import CameraCalibration
 
 METRES_PER_COUNT = 10 / 65535
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core.camera import CameraCalibration, PinholeCamera
 from splatam_core.datasets import files
+from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 
 INTRINSICS = ('w', 'h', 'fl_x', 'fl_y', 'cx', 'cy')
 

@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core.camera import CameraCalibration, FrameFactory, PinholeCamera
 from splatam_core.datasets import base, files
 from splatam_core.errors import DatasetError
-from splatam_core.types import RgbdFrame, Trajectory
+from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
+from splatam_core.geometry.trajectory import Trajectory
+from splatam_core.images.rectification import FrameFactory
+from splatam_core.types import RgbdFrame
 
 
 @dataclass(frozen=True, slots=True)

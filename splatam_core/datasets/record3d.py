@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core import se3
-from splatam_core.camera import CameraCalibration, PinholeCamera
 from splatam_core.datasets import base, files
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
 from splatam_core.errors import DatasetError
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 
 
 def read(folder: Path, *, width: int | None = None) -> ImagePairs:

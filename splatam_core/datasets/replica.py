@@ -19,9 +19,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from splatam_core.camera import CameraCalibration, CameraFile, PinholeCamera
 from splatam_core.datasets import base, files
+from splatam_core.datasets.camera_file import CameraFile
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, row_trajectory
+from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 
 CAMERA = CameraFile(CameraCalibration(PinholeCamera(1200, 680, 600.0, 600.0, 599.5, 339.5)), 6553.5)
 

@@ -44,11 +44,13 @@ from msg_adapters import camera_info, images, poses
 from msg_adapters.errors import MessageError
 from msg_adapters.factory import RosbagsMessages
 from msg_adapters.synchronizer import RgbdSet, RgbdSynchronizer
-from splatam_core.camera import CameraCalibration, CameraFile, FrameFactory
 from splatam_core.datasets import base, files
+from splatam_core.datasets.camera_file import CameraFile
 from splatam_core.errors import CameraError, DatasetError, FrameError, SplatamError
-from splatam_core.trajectory import stamp_text
-from splatam_core.types import RgbdFrame, Trajectory
+from splatam_core.geometry.camera import CameraCalibration
+from splatam_core.geometry.trajectory import Trajectory, stamp_text
+from splatam_core.images.rectification import FrameFactory
+from splatam_core.types import RgbdFrame
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
@@ -129,9 +131,7 @@ class _Bag:
         self.is_ros1 = path.suffix == ROS1_SUFFIX
         self._encodings: dict[str, str] = {}
         with _reading(path), self._open() as reader:
-            self.connections = [
-                connection._replace(owner=None) for connection in reader.connections if connection.msgcount
-            ]
+            self.connections = [connection._replace(owner=None) for connection in reader.connections if connection.msgcount]
         if not self.connections:
             raise DatasetError(f'{path}: the bag is empty: there is no message on any topic; was anything recorded?')
 
@@ -291,8 +291,7 @@ def _check_complete(bag: _Bag, counts: dict[str, int]) -> None:
     for topic, count in counts.items():
         if count != bag.count(topic):
             raise DatasetError(
-                f'{bag.path}: {topic} has {count} messages of the {bag.count(topic)} that the bag states; '
-                'is the copy complete?'
+                f'{bag.path}: {topic} has {count} messages of the {bag.count(topic)} that the bag states; is the copy complete?'
             )
 
 
@@ -316,9 +315,7 @@ def _types(store: Stores = Stores.ROS2_JAZZY) -> Typestore:
 
 def _ros2_info(info: Any) -> Any:
     """A ROS 1 CameraInfo, whose matrices have capital names, as ROS 2 has it."""
-    return _types().types[INFO](
-        **{field.name.lower(): getattr(info, field.name) for field in fields(info) if field.init}
-    )
+    return _types().types[INFO](**{field.name.lower(): getattr(info, field.name) for field in fields(info) if field.init})
 
 
 def _calibration_of(bag: _Bag, topic: str, data: bytes) -> CameraCalibration:
@@ -355,9 +352,7 @@ def _calibration(bag: _Bag, index: _Index) -> CameraCalibration:
 
 def _pairs(bag: _Bag, chosen: dict[str, str], index: _Index) -> list[RgbdSet]:
     """Colour and depth messages, by their numbers, that belong together."""
-    pairing = RgbdSynchronizer(
-        mode='approximate', max_interval_ns=MAX_INTERVAL_NS, queue_size=QUEUE_SIZE, jump_ns=JUMP_NS
-    )
+    pairing = RgbdSynchronizer(mode='approximate', max_interval_ns=MAX_INTERVAL_NS, queue_size=QUEUE_SIZE, jump_ns=JUMP_NS)
     pairing.add_info(index.entries[0].stamp_ns if index.entries else 0, None)  # one camera, known beforehand
     counts = {'rgb': 0, 'depth': 0}
     add = {'rgb': pairing.add_color, 'depth': pairing.add_depth}
@@ -407,9 +402,7 @@ def _choose(bag: _Bag, what: str, option: str, wanted: str | None, fitting: list
     """The wanted topic, else the only one that fits."""
     if wanted is not None:
         if wanted not in allowed:
-            raise DatasetError(
-                f"{bag.path}: {option} '{wanted}' is no {what} topic with messages; there is {_listed(allowed)}"
-            )
+            raise DatasetError(f"{bag.path}: {option} '{wanted}' is no {what} topic with messages; there is {_listed(allowed)}")
         return wanted
     if len(fitting) == 1:
         return fitting[0]

@@ -26,10 +26,10 @@ from pathlib import Path
 
 import numpy as np
 
-from splatam_core.camera import PinholeCamera
 from splatam_core.datasets import base, files
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
-from splatam_core.types import Trajectory
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.geometry.trajectory import Trajectory
 
 DEPTH_SCALE = 1000.0
 SAME_PLACE = 1e-3  # 1 mm, and less than a fifth of a pixel

@@ -17,10 +17,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from splatam_core.camera import CameraCalibration, PinholeCamera
 from splatam_core.datasets import base, files
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
-from splatam_core.types import Trajectory
+from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
+from splatam_core.geometry.trajectory import Trajectory
 
 DEFAULT_CAMERA = CameraCalibration(PinholeCamera(640, 480, 585.0, 585.0, 320.0, 240.0))
 DEFAULT_DEPTH_SCALE = 1000.0
@@ -63,6 +63,4 @@ def _open(source: str, options: base.ReadOptions) -> ImagePairs:
     return read(Path(source), width=options.width)
 
 
-FORMAT = base.Format(
-    'sevenscenes', 'a folder with frame-000000.color.png (or .jpg) and frame-000000.depth.png', _recognises, _open
-)
+FORMAT = base.Format('sevenscenes', 'a folder with frame-000000.color.png (or .jpg) and frame-000000.depth.png', _recognises, _open)

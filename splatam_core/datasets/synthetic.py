@@ -30,11 +30,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core.camera import CameraCalibration, FrameFactory, PinholeCamera
 from splatam_core.datasets import base
 from splatam_core.datasets.room import build_room, look_at
 from splatam_core.errors import DatasetError
-from splatam_core.types import RgbdFrame, Trajectory
+from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
+from splatam_core.geometry.trajectory import Trajectory
+from splatam_core.images.rectification import FrameFactory
+from splatam_core.types import RgbdFrame
 
 CAMERA = PinholeCamera(640, 480, 525.0, 525.0, 319.5, 239.5)
 MOTIONS = {'calm': 300, 'fast': 120}
@@ -120,9 +122,7 @@ class Walk:
         return look_at(eye, eye + forward, 0.03 * np.sin(around[1]) + 0.006 * tremor[5])
 
 
-def measured(
-    depth_m: NDArray[np.float32], incidence: NDArray[np.float32], rng: np.random.Generator
-) -> NDArray[np.float32]:
+def measured(depth_m: NDArray[np.float32], incidence: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
     """Depth as a structured-light camera measures it.
 
     The error along the axis grows with the square of the depth (Khoshelham and Elberink 2012, 1.4 mm
@@ -196,6 +196,4 @@ def _choice(key: str, text: str, allowed: tuple[str, ...]) -> str:
     return text
 
 
-FORMAT = base.Format(
-    SCHEME, f"'{SCHEME}' or '{SCHEME}:' with {OPTIONS}", _recognises, _open, is_path=False
-)
+FORMAT = base.Format(SCHEME, f"'{SCHEME}' or '{SCHEME}:' with {OPTIONS}", _recognises, _open, is_path=False)

@@ -23,11 +23,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core.camera import CameraCalibration, PinholeCamera
 from splatam_core.datasets import base, files
 from splatam_core.datasets.pairs import DepthFormat, ImagePair, ImagePairs
 from splatam_core.errors import DatasetError
-from splatam_core.trajectory import read_trajectory, stamp_from_text, stamp_text
+from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
+from splatam_core.geometry.trajectory import read_trajectory, stamp_from_text, stamp_text
 
 DEFAULT_DEPTH_SCALE = 5000.0
 MAX_INTERVAL_NS = 20_000_000
@@ -112,9 +112,7 @@ def _read_list(path: Path) -> list[tuple[int, str]]:
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f'{path}: cannot be read: {error}') from None
     rows = [
-        _parse_row(path, number, line)
-        for number, line in enumerate(lines, 1)
-        if line.strip() and not line.lstrip().startswith('#')
+        _parse_row(path, number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith('#')
     ]
     for (before, _), (after, _) in pairwise(rows):
         if after <= before:

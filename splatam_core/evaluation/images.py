@@ -16,14 +16,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatam_core import se3
-from splatam_core.backend import pose_tensor
 from splatam_core.config import DepthConfig
+from splatam_core.device import pose_tensor
 from splatam_core.evaluation.similarity import ms_ssim
-from splatam_core.losses import ssim_map
+from splatam_core.geometry import se3
+from splatam_core.images.ssim import ssim_map
+from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians, Rasterizer, Render
+from splatam_core.runs.metrics import ImageScores, OriginalScores
 from splatam_core.types import RgbdFrame
-from splatam_core.view import View
 
 MIN_SQUARED_ERROR = 1e-10
 """Identical images score 100 dB, not infinity: that is no number in JSON, nor can it be averaged."""
@@ -34,46 +35,6 @@ MAX_HOLE_SHARE = 0.001
 
 ImageDistance = Callable[[Tensor, Tensor], 'float | None']
 Scores = TypeVar('Scores', 'ImageScores', 'OriginalScores')
-
-
-@dataclass(frozen=True, slots=True)
-class ImageScores:
-    """One view's scores, or their mean over views.
-
-    Attributes:
-        psnr_db: of the colour over the pixels with a depth reading; None where there is no such pixel.
-        ssim: likewise.
-        depth_l1_m: mean absolute difference to the reading; a pixel that renders no depth differs by all of it.
-        psnr_full_db: of the colour over the whole image, holes included.
-        depth_rmse_m: root of the mean squared difference to the reading.
-        ms_ssim: of whole images; None where they are too small for it.
-        lpips: of whole images; None where it cannot be had.
-    """
-
-    psnr_db: float | None = None
-    ssim: float | None = None
-    depth_l1_m: float | None = None
-    psnr_full_db: float | None = None
-    depth_rmse_m: float | None = None
-    ms_ssim: float | None = None
-    lpips: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class OriginalScores:
-    """What SplaTAM's evaluation computes: both images black where there is no reading, and those pixels count.
-
-    Attributes:
-        psnr_db: mean of the channels' PSNR, the render not clamped.
-        ms_ssim: which the original prints as "SSIM".
-        lpips: AlexNet.
-        depth_l1_m: of the sum of ``w z``, not divided by the silhouette; the original prints it as "Depth RMSE" too.
-    """
-
-    psnr_db: float | None = None
-    ms_ssim: float | None = None
-    lpips: float | None = None
-    depth_l1_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,9 +130,7 @@ def score_view(
     )
 
 
-def original_scores(
-    render: Render, rgb: Tensor, reading_m: Tensor, lpips: ImageDistance | None = None
-) -> OriginalScores:
+def original_scores(render: Render, rgb: Tensor, reading_m: Tensor, lpips: ImageDistance | None = None) -> OriginalScores:
     """Compare as SplaTAM's ``eval_helpers.py`` does (read at commit da6bbcd; restated, not copied).
 
     Args:

@@ -11,22 +11,21 @@ from numpy.typing import NDArray
 from splatam_core.datasets.base import Sequence, frame_or_none
 from splatam_core.errors import RunFolderError
 from splatam_core.evaluation.images import FrameScores, ViewScorer, mean_original_scores, mean_scores
-from splatam_core.evaluation.metrics import Metrics
 from splatam_core.evaluation.similarity import LPIPS_MIN_SIDE, MIN_SIDE, Lpips, load_lpips
 from splatam_core.evaluation.trajectory import (
     RelativePoseError,
     TrajectoryError,
     align_poses,
-    interpolate_poses,
     relative_pose_errors,
     splatam_ate_mean_m,
     trajectory_error,
     transformed,
 )
+from splatam_core.geometry.trajectory import Trajectory, interpolate_poses, stamp_text
 from splatam_core.rasterizer import rasterizer_for
-from splatam_core.run_folder import RunRecord
-from splatam_core.trajectory import stamp_text
-from splatam_core.types import RgbdFrame, Trajectory
+from splatam_core.runs.metrics import Metrics
+from splatam_core.runs.run_folder import RunRecord
+from splatam_core.types import RgbdFrame
 
 Progress = Callable[[range], Iterable[int]]
 Pose = NDArray[np.float64]
@@ -237,9 +236,7 @@ def score_images(run: RunRecord, sequence: Sequence, every: int, progress: Progr
     return ImageEvaluation(every, tuple(of_all.values()), tuple(of_held_out.values()), tuple(samples), notes)
 
 
-def score_novel_views(
-    run: RunRecord, truth: Trajectory, test: Sequence, alignment: str, progress: Progress
-) -> NovelViews:
+def score_novel_views(run: RunRecord, truth: Trajectory, test: Sequence, alignment: str, progress: Progress) -> NovelViews:
     """Render a run's map at the true poses of a test split and compare with what was seen there.
 
     Args:

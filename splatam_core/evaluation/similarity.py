@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from splatam_core.losses import ssim_terms
+from splatam_core.images.ssim import ssim_terms
 
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Of the five scales, finest first (Wang et al. 2003, section 3.2)."""

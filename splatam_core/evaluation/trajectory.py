@@ -14,18 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core import se3
 from splatam_core.errors import RunFolderError
-from splatam_core.trajectory import stamp_text
-from splatam_core.types import Trajectory
+from splatam_core.geometry import se3
+from splatam_core.geometry.trajectory import (
+    Trajectory,
+    interpolate_centres,
+    interpolate_poses,
+    stamp_text,
+)
 
 Indices = NDArray[np.intp]
 
-MAX_TRUTH_GAP_NS = 500_000_000
-"""Between two truth poses further apart than this a position would be a guess: such frames are not scored."""
-
-STAMP_ROUNDING_NS = 1_000_000
-"""A frame this close to a truth pose is at it, even outside the truth's span: files round their stamps."""
 
 ONE_SECOND_NS = 1_000_000_000
 
@@ -166,60 +165,6 @@ def splatam_ate_mean_m(estimate: Trajectory, truth: Trajectory) -> float:
     points, true_points = (se3.inverse(T)[:, :3, 3] for T in (poses, true_poses))
     T = align(true_points, points)
     return float(np.linalg.norm(points - (true_points @ T[:3, :3].T + T[:3, 3]), axis=1).mean())
-
-
-def interpolate_poses(truth: Trajectory, stamps_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """True poses at some stamps: centres linear in between, rotations at constant angular speed.
-
-    Args:
-        truth: N poses.
-        stamps_ns: [M] int64.
-
-    Returns:
-        T_world_cam [M, 4, 4], and [M] whether each is known: inside the truth's span and in no gap of it.
-    """
-    centres, known = interpolate_centres(truth, stamps_ns)
-    poses = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
-    for index in np.flatnonzero(known):
-        poses[index, :3, :3] = _interpolated_rotation(truth, int(stamps_ns[index]))
-        poses[index, :3, 3] = centres[index]
-    return poses, known
-
-
-def _interpolated_rotation(truth: Trajectory, stamp_ns: int) -> NDArray[np.float64]:
-    after = min(int(np.searchsorted(truth.stamps_ns, stamp_ns)), len(truth) - 1)
-    before = max(0, after - 1)
-    R_before, R_after = truth.T_world_cam[before, :3, :3], truth.T_world_cam[after, :3, :3]
-    interval_ns = int(truth.stamps_ns[after] - truth.stamps_ns[before])
-    share = float(np.clip((stamp_ns - int(truth.stamps_ns[before])) / interval_ns, 0, 1)) if interval_ns else 0.0
-    turn = np.zeros(6)
-    turn[3:] = share * se3.rotation_vector(R_before.T @ R_after)
-    return R_before @ se3.exp(turn)[:3, :3]
-
-
-def interpolate_centres(
-    truth: Trajectory, stamps_ns: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """True camera centres at some stamps, linear in between.
-
-    Args:
-        truth: N poses.
-        stamps_ns: [M] int64.
-
-    Returns:
-        centres_m [M, 3], and [M] whether each is known: inside the truth's span and in no gap of it.
-    """
-    if len(truth) == 0:
-        return np.zeros((len(stamps_ns), 3)), np.zeros(len(stamps_ns), dtype=bool)
-    # Seconds since the truth's start: 64-bit floats hold those, not epoch nanoseconds, to the last digit.
-    truth_s, at_s = ((stamps - truth.stamps_ns[0]) * 1e-9 for stamps in (truth.stamps_ns, stamps_ns))
-    centres = np.stack([np.interp(at_s, truth_s, truth.T_world_cam[:, axis, 3]) for axis in range(3)], axis=1)
-    after = np.searchsorted(truth.stamps_ns, stamps_ns)  # first truth pose not before the stamp
-    last = len(truth) - 1
-    above, below = truth.stamps_ns[np.minimum(after, last)], truth.stamps_ns[np.clip(after - 1, 0, last)]
-    inside = (stamps_ns >= truth.stamps_ns[0]) & (stamps_ns <= truth.stamps_ns[-1])
-    nearest_ns = np.minimum(np.abs(above - stamps_ns), np.abs(stamps_ns - below))
-    return centres, (inside & (above - below <= MAX_TRUTH_GAP_NS)) | (nearest_ns <= STAMP_ROUNDING_NS)
 
 
 def align(source: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:

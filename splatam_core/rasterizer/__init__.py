@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from splatam_core.backend import choose_backend
 from splatam_core.config import SlamConfig
+from splatam_core.device import choose_backend
 from splatam_core.rasterizer.base import Gaussians, Moments, Rasterizer, Rates, Render, Target, joined
 
 __all__ = [
@@ -46,7 +46,7 @@ def _reference(threads: int) -> Rasterizer:
 
 
 def _triton(threads: int) -> Rasterizer:
-    from splatam_core.rasterizer.triton import TritonRasterizer
+    from splatam_core.rasterizer.triton.rasterizer import TritonRasterizer
 
     return TritonRasterizer()
 

@@ -22,8 +22,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from splatam_core.camera import PinholeCamera
 from splatam_core.errors import RasterizerError
+from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.rasterizer.bounds import BLOCK, block_bounds
 from splatam_core.types import RenderedView
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatam_core.filters import is_on_host
+from splatam_core.images.filters import is_on_host
 
 BLOCK = 1024
 

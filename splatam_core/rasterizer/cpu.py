@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatam_core.camera import PinholeCamera
 from splatam_core.errors import RasterizerError
+from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.rasterizer.base import (
     COLOR_LIMIT,
     DEPTH_LIMIT_M,
@@ -133,8 +133,7 @@ class _Splat(torch.autograd.Function):
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
         *inputs, rgb_image, depth_acc, silhouette = ctx.saved_tensors
         gradients = [
-            torch.zeros_like(tensor) if wanted else None
-            for tensor, wanted in zip(inputs, ctx.needs_input_grad, strict=False)
+            torch.zeros_like(tensor) if wanted else None for tensor, wanted in zip(inputs, ctx.needs_input_grad, strict=False)
         ]
         pose = torch.zeros(4, 4)
         ctx.engine.backward(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splatam_core.camera import PinholeCamera
+from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.rasterizer.base import BLUR_PX2, NEAR_M, Gaussians
 
 MARGIN = 0.15  # of the image's size: beyond it the projection's slope is held, where it would run off

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from splatam_core.camera import PinholeCamera
+from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.rasterizer.base import (
     BETA_1,
     BLUR_PX2,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 
-from splatam_core.backend import HOST
 from splatam_core.config import TrackingConfig
+from splatam_core.device import HOST
 from splatam_core.rasterizer import Rasterizer
-from splatam_core.tracking.align import AlignmentTracker
+from splatam_core.tracking.alignment import AlignmentTracker
 from splatam_core.tracking.base import Tracker, TrackingResult
 from splatam_core.tracking.none import NullTracker
 from splatam_core.tracking.render_and_compare import RenderAndCompareTracker
@@ -23,9 +23,7 @@ _TRACKERS = {
 }  # fmt: skip
 
 
-def make_tracker(
-    rasterizer: Rasterizer, config: TrackingConfig, threads: int = 0, device: torch.device = HOST
-) -> Tracker:
+def make_tracker(rasterizer: Rasterizer, config: TrackingConfig, threads: int = 0, device: torch.device = HOST) -> Tracker:
     """The tracker that the configuration names.
 
     Args:

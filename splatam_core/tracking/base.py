@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatam_core.config import TrackingConfig
-from splatam_core.filters import is_on_host
-from splatam_core.losses import TrackingLoss
+from splatam_core.images.filters import is_on_host
+from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians, Render
-from splatam_core.view import View
+from splatam_core.tracking.loss import TrackingLoss
 
 Matrix = NDArray[np.float64]
 

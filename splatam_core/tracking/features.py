@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from splatam_core.images.view import View
 from splatam_core.rasterizer import Render
-from splatam_core.view import View
 
 Matrix = NDArray[np.float64]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 
 from splatam_core.config import TrackingConfig
+from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians, Rasterizer
 from splatam_core.tracking.base import Matrix, TrackingResult
-from splatam_core.view import View
 
 
 class NullTracker:

@@ -9,13 +9,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatam_core import se3
 from splatam_core.config import TrackingConfig
-from splatam_core.filters import is_on_host
-from splatam_core.losses import TrackingLoss, tracking_loss
+from splatam_core.geometry import se3
+from splatam_core.images.filters import is_on_host
+from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians, Rasterizer
 from splatam_core.tracking.base import Candidate, Matrix, TrackingResult, judge
-from splatam_core.view import View
+from splatam_core.tracking.loss import TrackingLoss, tracking_loss
 
 
 class RenderAndCompareTracker:

@@ -149,9 +149,7 @@ def _sampled(layers: Tensor, moved: _Moved) -> Tensor:
     return upper * (1 - below) + lower * below
 
 
-def _slopes(
-    moved: _Moved, along_u: Tensor, along_v: Tensor, upright: Tensor, light: Tensor, speed: Tensor
-) -> Tensor:
+def _slopes(moved: _Moved, along_u: Tensor, along_v: Tensor, upright: Tensor, light: Tensor, speed: Tensor) -> Tensor:
     """[9, 2, P] change of the residuals with the unknowns; along_u and along_v are those of the frame, times focal length."""
     x, y, z = moved.x, moved.y, moved.z
     a, b = along_u * moved.inverse_z, along_v * moved.inverse_z

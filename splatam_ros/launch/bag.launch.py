@@ -46,8 +46,7 @@ def generate_launch_description() -> LaunchDescription:
         arguments=[LaunchConfiguration('bag'), '--rate', value['rate'], '--wait-for'],
     )
     arguments = [
-        DeclareLaunchArgument(name, default_value=default, description=description)
-        for name, default, description in ARGUMENTS
+        DeclareLaunchArgument(name, default_value=default, description=description) for name, default, description in ARGUMENTS
     ]
     bag = DeclareLaunchArgument('bag', description='the recording: a rosbag2 folder or file')
     return LaunchDescription([*arguments, bag, node, player])

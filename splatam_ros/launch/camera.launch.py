@@ -29,10 +29,7 @@ def start(context: LaunchContext) -> list[Node]:
         raise ValueError(f"camera '{name}': expected one of {', '.join(CAMERAS)}")
     camera = CAMERAS[name]
     parameter_file = PathJoinSubstitution([FindPackageShare('splatam_ros'), 'config', 'ros', f'{name}.yaml'])
-    given = {
-        name: ParameterValue(LaunchConfiguration(name), value_type=str)
-        for name in ('preset', 'save_path', 'load_path')
-    }
+    given = {name: ParameterValue(LaunchConfiguration(name), value_type=str) for name in ('preset', 'save_path', 'load_path')}
     return [
         Node(
             package='splatam_ros',
@@ -48,7 +45,6 @@ def start(context: LaunchContext) -> list[Node]:
 def generate_launch_description() -> LaunchDescription:
     """The node, once the camera's name is known."""
     arguments = [
-        DeclareLaunchArgument(name, default_value=default, description=description)
-        for name, default, description in ARGUMENTS
+        DeclareLaunchArgument(name, default_value=default, description=description) for name, default, description in ARGUMENTS
     ]
     return LaunchDescription([*arguments, OpaqueFunction(function=start)])

@@ -51,7 +51,6 @@ def generate_launch_description() -> LaunchDescription:
         on_exit=Shutdown(),
     )
     arguments = [
-        DeclareLaunchArgument(name, default_value=default, description=description)
-        for name, default, description in ARGUMENTS
+        DeclareLaunchArgument(name, default_value=default, description=description) for name, default, description in ARGUMENTS
     ]
     return LaunchDescription([*arguments, node])

@@ -129,9 +129,7 @@ def test_a_full_queue_drops_the_oldest():
     assert feed.stamps == [3, 5]
 
 
-@pytest.mark.parametrize(
-    'settings', [{'mode': 'fuzzy'}, {'max_interval_ns': -1}, {'queue_size': 0}, {'jump_ns': -1}]
-)
+@pytest.mark.parametrize('settings', [{'mode': 'fuzzy'}, {'max_interval_ns': -1}, {'queue_size': 0}, {'jump_ns': -1}])
 def test_settings_out_of_range_are_errors(settings):
     with pytest.raises(ValueError, match=f'{next(iter(settings.values()))}'):
         RgbdSynchronizer(**settings)

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from rosbags import rosbag1
 from rosbags.typesys import Stores, get_typestore
 
-from splatam_core import se3
-from splatam_core.camera import PinholeCamera
 from splatam_core.datasets import write_bag
 from splatam_core.datasets.room import build_room
 from splatam_core.datasets.synthetic import SyntheticSequence, Walk
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
 
 CAMERA = PinholeCamera(96, 72, 79.0, 78.0, 47.2, 35.9)
 FRAMES = (0, 6, 12)  # of the walk: 0.2 s apart, some centimetres and degrees

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatam_core import se3
-from splatam_core.camera import PinholeCamera
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.rasterizer import Gaussians, Rasterizer, Render, base, reference
 from splatam_core.rasterizer.reference import ReferenceRasterizer
 

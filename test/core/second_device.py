@@ -16,7 +16,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map_only
 
-from splatam_core.camera import PinholeCamera
+from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.rasterizer import Gaussians, Moments, Rasterizer, Rates, Render, Target, make_rasterizer
 
 DEVICE = torch.device('cuda', 7)
@@ -138,9 +138,7 @@ class _Dispatch(TorchDispatchMode):
         if to_host:
             return result
         by_values = {id(tensor.values): tensor for tensor in there}  # what is changed in place stays the tensor it is
-        return tree_map_only(
-            torch.Tensor, lambda v: by_values[id(v)] if id(v) in by_values else DeviceTensor(v), result
-        )
+        return tree_map_only(torch.Tensor, lambda v: by_values[id(v)] if id(v) in by_values else DeviceTensor(v), result)
 
     def _check(self, func: Any, tensors: list[torch.Tensor]) -> None:
         strangers = [tensor for tensor in tensors if not isinstance(tensor, DeviceTensor) and tensor.dim() > 0]
@@ -149,9 +147,7 @@ class _Dispatch(TorchDispatchMode):
             raise RuntimeError(f'{func}: expected all tensors on the device, found {sizes} on the host')
 
     def _count(self, func: Any, there: list[DeviceTensor], kwargs: dict[str, Any]) -> None:
-        by_mask = func in (aten.index.Tensor, aten.index_put_.default) and any(
-            tensor.dtype == torch.bool for tensor in there[1:]
-        )
+        by_mask = func in (aten.index.Tensor, aten.index_put_.default) and any(tensor.dtype == torch.bool for tensor in there[1:])
         to_host = func is aten._to_copy.default and kwargs.get('device') == torch.device('cpu')
         if func in WAITS or by_mask or to_host:
             self._device.waits[str(func)] += 1
@@ -194,9 +190,7 @@ class _Native(torch.autograd.Function):
     def backward(ctx: Any, *slopes: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         wanted = [tensor for tensor in ctx.inputs if tensor is not None and tensor.requires_grad]
         found = iter(torch.autograd.grad(ctx.images, wanted, [on_host(slope) for slope in slopes]))
-        gradients = [
-            DeviceTensor(next(found)) if tensor is not None and tensor.requires_grad else None for tensor in ctx.inputs
-        ]
+        gradients = [DeviceTensor(next(found)) if tensor is not None and tensor.requires_grad else None for tensor in ctx.inputs]
         return None, None, *gradients
 
 

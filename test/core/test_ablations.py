@@ -8,9 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from splatam_core.ablations import FULL, variant_names, variants
 from splatam_core.cli import main
 from splatam_core.config import flat_values
+from splatam_core.evaluation.ablations import FULL, variant_names, variants
 
 SMALL = ['synthetic', '--width', '48', '--max-frames', '3', '--set', 'threads=1', '--set', 'tracking.iterations=2',
          '--set', 'mapping.iterations=2']  # fmt: skip
@@ -39,13 +39,11 @@ def in_this_process(command: list[str], **_: object) -> subprocess.CompletedProc
     return subprocess.CompletedProcess(command, main(command[3:]))
 
 
-def test_a_set_is_run_once_and_printed(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_set_is_run_once_and_printed(tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     command = ['ablations', *SMALL, '--only', 'full', 'no_velocity', '--out', str(tmp_path)]
     assert main(['ablations', *SMALL, '--only', 'full', '--out', str(tmp_path)]) == 0
     capfd.readouterr()
-    monkeypatch.setattr('splatam_core.ablations.subprocess', SimpleNamespace(run=in_this_process))
+    monkeypatch.setattr('splatam_core.evaluation.ablations.subprocess', SimpleNamespace(run=in_this_process))
     assert main(command) == 0
     first = capfd.readouterr()
     assert 'runs: 1' in first.out and '| full | 3/3 |' in first.out and '| no_velocity | 3/3 |' in first.out

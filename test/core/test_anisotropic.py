@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from splatam_core import se3
 from splatam_core.config import load_config
 from splatam_core.datasets import open_sequence
 from splatam_core.errors import ConfigError, RasterizerError
-from splatam_core.gaussian_map import GaussianMap
-from splatam_core.ply import read_ply, write_ply
+from splatam_core.geometry import se3
+from splatam_core.mapping.gaussian_map import GaussianMap
+from splatam_core.maps.ply import read_ply, write_ply
 from splatam_core.rasterizer import Gaussians, Rates
 from splatam_core.slam import Slam
 from splatam_core.types import Status

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from splatam_core import backend, cli
-from splatam_core.backend import INTERPRET, choose_backend
+from splatam_core import cli
+from splatam_core import device as device_module
 from splatam_core.config import load_config
+from splatam_core.device import INTERPRET, choose_backend
 from splatam_core.errors import ConfigError
 from splatam_core.slam import Slam
 
@@ -27,7 +28,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, 'is_available', lambda: True)
     monkeypatch.setattr(torch.cuda, 'current_device', lambda: 0)
     monkeypatch.setattr(torch.cuda, 'get_device_name', lambda: 'A GPU')
-    monkeypatch.setattr(backend.importlib.util, 'find_spec', lambda name: object())
+    monkeypatch.setattr(device_module.importlib.util, 'find_spec', lambda name: object())
 
 
 @pytest.fixture
@@ -67,7 +68,7 @@ def test_choices_without_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (device, rasterizer) == (CPU, 'cpu') and torch.__version__ in why and 'sees no GPU' in why
     assert _chosen('rasterizer=reference')[:2] == (CPU, 'reference')
     monkeypatch.setenv(INTERPRET, '1')
-    monkeypatch.setattr(backend.importlib.util, 'find_spec', lambda name: object())
+    monkeypatch.setattr(device_module.importlib.util, 'find_spec', lambda name: object())
     assert _chosen('rasterizer=triton')[:2] == (CPU, 'triton')
     assert _chosen('rasterizer=triton', 'device=cpu')[:2] == (CPU, 'triton')
 
@@ -84,10 +85,8 @@ def test_choices_without_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
         (('rasterizer=triton', 'device=cpu'), 'rasterizer = triton: needs a GPU, and device = cpu; set rasterizer=auto'),
     ],
 )
-def test_what_is_not_there_is_one_clear_error(
-    overrides: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(backend.importlib.util, 'find_spec', lambda name: object())
+def test_what_is_not_there_is_one_clear_error(overrides: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device_module.importlib.util, 'find_spec', lambda name: object())
     with pytest.raises(ConfigError, match=message) as error:
         Slam(load_config('quick', overrides))
     assert '\n' not in str(error.value)
@@ -96,7 +95,7 @@ def test_what_is_not_there_is_one_clear_error(
 @pytest.mark.usefixtures('gpu')
 def test_a_gpu_without_triton(monkeypatch: pytest.MonkeyPatch) -> None:
     """Auto stays on the processor and says why; asked for, it is an error."""
-    monkeypatch.setattr(backend.importlib.util, 'find_spec', lambda name: None)
+    monkeypatch.setattr(device_module.importlib.util, 'find_spec', lambda name: None)
     device, rasterizer, why = _chosen()
     assert (device, rasterizer) == (CPU, 'cpu') and 'triton is not installed' in why
     with pytest.raises(ConfigError, match='rasterizer = triton: triton is not installed'):

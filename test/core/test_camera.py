@@ -8,8 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from splatam_core.camera import CameraCalibration, FrameFactory, PinholeCamera, read_camera_file
+from splatam_core.datasets.camera_file import read_camera_file
 from splatam_core.errors import CameraError, FrameError
+from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
+from splatam_core.images.rectification import FrameFactory
 
 CAMERA = PinholeCamera(64, 48, 60.0, 61.0, 31.0, 24.5)
 

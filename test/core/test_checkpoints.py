@@ -24,15 +24,17 @@ import pytest
 import torch
 import yaml
 
-from splatam_core import checkpoints, cli, resuming
-from splatam_core.checkpoints import Checkpoints, Progress, SlamState, checkpoint_paths, read_checkpoint, read_newest
+from splatam_core import cli
 from splatam_core.commands.shared import open_source
 from splatam_core.config import load_config
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.errors import CheckpointError
-from splatam_core.run_folder import read_run
-from splatam_core.sealed import Content, seal, unseal
+from splatam_core.runs import checkpoints, resume
+from splatam_core.runs.archive import Content, seal, unseal
+from splatam_core.runs.checkpoints import Checkpoints, Progress, checkpoint_paths, read_checkpoint, read_newest
+from splatam_core.runs.run_folder import read_run
 from splatam_core.slam import Slam
+from splatam_core.state import SlamState
 
 ROOT = Path(__file__).resolve().parents[2]
 WIDTH, FRAMES, EVERY = 64, 8, 3
@@ -111,7 +113,7 @@ def killed_after(frames: int, words: list[str]) -> None:
     code = """
         import os, signal, sys
         from splatam_core import cli
-        from splatam_core.run_folder import RunFolder
+        from splatam_core.runs.run_folder import RunFolder
 
         append = RunFolder.append
 
@@ -163,15 +165,15 @@ def test_killed_and_resumed_time_and_again(whole: dict[str, Path], tmp_path: Pat
 def test_ctrl_c_saves_a_checkpoint_of_the_last_frame(
     whole: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    after_frame = resuming.CheckpointWriter.after_frame
+    after_frame = resume.CheckpointWriter.after_frame
 
-    def interrupted(writer: resuming.CheckpointWriter, index: int, *others: object) -> None:
+    def interrupted(writer: resume.CheckpointWriter, index: int, *others: object) -> None:
         after_frame(writer, index, *others)
         if index == 3:
             os.kill(os.getpid(), signal.SIGINT)
 
     with monkeypatch.context() as patch:
-        patch.setattr(resuming.CheckpointWriter, 'after_frame', interrupted)
+        patch.setattr(resume.CheckpointWriter, 'after_frame', interrupted)
         assert splatam(*arguments('quick', tmp_path / 'run', '--checkpoint-every', EVERY)) == cli.EXIT_INTERRUPTED
     assert f"'splatam run --resume {tmp_path / 'run'}' goes on" in capsys.readouterr().err
     assert read_newest(tmp_path / 'run' / 'checkpoints').progress.num_lines == 4
@@ -210,7 +212,7 @@ def test_the_last_line_may_be_cut_off(run: Path, whole: dict[str, Path]) -> None
 def test_map_and_scores_of_frames_to_be_redone_are_removed(run: Path) -> None:
     for name in ('map.ply', 'metrics.json', 'report.png'):
         (run / name).write_text('of more frames')
-    resuming.resume(run, open_source, lambda config: None, lambda text: None).folder.close()
+    resume.resume(run, open_source, lambda config: None, lambda text: None).folder.close()
     assert not any((run / name).exists() for name in ('map.ply', 'metrics.json', 'report.png'))
     assert len(read_run(run).frames) == len((run / 'trajectory.txt').read_text().splitlines()) == 6
 
@@ -256,9 +258,7 @@ def test_a_state_of_another_kind_of_map_is_refused(state: SlamState) -> None:
 # --- files ---
 
 
-def test_keyframes_are_written_once_and_removed_with_the_last_checkpoint_that_has_them(
-    state: SlamState, tmp_path: Path
-) -> None:
+def test_keyframes_are_written_once_and_removed_with_the_last_checkpoint_that_has_them(state: SlamState, tmp_path: Path) -> None:
     writer = Checkpoints(tmp_path, 2)
     writer.save(replace(state, keyframes=state.keyframes[:1]), PROGRESS)
     first = {path: path.stat().st_mtime_ns for path in (tmp_path / 'keyframes').iterdir()}
@@ -288,7 +288,7 @@ def test_a_process_killed_while_saving_leaves_the_checkpoint_before(state: SlamS
         import os, signal, sys
         from dataclasses import replace
         from pathlib import Path
-        from splatam_core.checkpoints import Checkpoints, read_newest
+        from splatam_core.runs.checkpoints import Checkpoints, read_newest
 
         countdown, fsync = int(sys.argv[2]), os.fsync
 
@@ -319,7 +319,7 @@ def test_a_process_killed_anywhere_while_saving_leaves_a_checkpoint(state: SlamS
         import sys
         from dataclasses import replace
         from pathlib import Path
-        from splatam_core.checkpoints import Checkpoints, read_newest
+        from splatam_core.runs.checkpoints import Checkpoints, read_newest
 
         old = read_newest(Path(sys.argv[1]))
         print('ready', flush=True)
@@ -422,9 +422,7 @@ def test_damaged_keyframes_are_refused(damage: str, run: Path, capsys: pytest.Ca
     assert path.name in line and expected in line and 'move 000006.checkpoint away' in line
 
 
-def test_the_error_shows_a_way_out_that_works(
-    run: Path, whole: dict[str, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_error_shows_a_way_out_that_works(run: Path, whole: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
     newest = run / 'checkpoints' / '000006.checkpoint'
     newest.write_bytes(newest.read_bytes()[:-100])
     assert 'move 000006.checkpoint away to go on from 000003.checkpoint' in refused(run, capsys)
@@ -513,9 +511,7 @@ def test_other_settings_are_refused(run: Path, capsys: pytest.CaptureFixture[str
         ({'path': '/nowhere'}, '/nowhere'),
     ],
 )
-def test_other_frames_are_refused(
-    changed: dict[str, object], said: str, run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_other_frames_are_refused(changed: dict[str, object], said: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     information = json.loads((run / 'run.json').read_text())
     information['source'] |= changed
     (run / 'run.json').write_text(json.dumps(information))
@@ -546,7 +542,7 @@ def test_what_cannot_be_resumed_is_said(
 
 
 def test_other_code_is_said(run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(resuming.environment, 'commit', lambda: 'another')
+    monkeypatch.setattr(resume.environment, 'commit', lambda: 'another')
     assert splatam('run', '--resume', run, '--no-evaluate') == 0
     assert 'goes on by another: the result may differ' in capsys.readouterr().err
 

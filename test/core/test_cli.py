@@ -20,10 +20,10 @@ from splatam_core.cli import COMMANDS, main
 from splatam_core.commands.shared import at_width
 from splatam_core.config import load_config
 from splatam_core.datasets.registry import open_sequence
-from splatam_core.ply import read_ply
-from splatam_core.run_folder import RunDescription, RunFolder, Source, read_run
+from splatam_core.geometry.trajectory import pose_line, stamp_text
+from splatam_core.maps.ply import read_ply
+from splatam_core.runs.run_folder import RunDescription, RunFolder, Source, read_run
 from splatam_core.slam import Slam
-from splatam_core.trajectory import pose_line, stamp_text
 from splatam_core.types import FrameResult, RgbdFrame
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -171,9 +171,7 @@ def test_existing_results_stay_unless_told_otherwise(copy: Path, capsys: pytest.
         (['--format', 'vhs'], "'vhs'"),
     ],
 )
-def test_user_errors_are_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
+def test_user_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str) -> None:
     assert splatam('run', SOURCE, *arguments, '--out', tmp_path / 'run') == 2
     error = capsys.readouterr().err
     assert error.startswith('splatam: error: ') and message in error and error.count('\n') == 1

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 import torch
 
-from splatam_core import se3
 from splatam_core.cli import main
 from splatam_core.config import load_config
 from splatam_core.datasets.registry import open_sequence
-from splatam_core.evaluation.metrics import Metrics
-from splatam_core.ply import read_ply
+from splatam_core.geometry import se3
+from splatam_core.geometry.trajectory import pose_line
+from splatam_core.maps.ply import read_ply
 from splatam_core.rasterizer import make_rasterizer
-from splatam_core.run_folder import RunRecord, Source, read_run
-from splatam_core.trajectory import pose_line
+from splatam_core.runs.metrics import Metrics
+from splatam_core.runs.run_folder import RunRecord, Source, read_run
 
 WIDTH, FRAMES, HOLD_OUT = 64, 6, 3
 SOURCE = ['synthetic', '--width', WIDTH, '--max-frames', FRAMES]
@@ -90,9 +90,7 @@ def replica_v2(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_test_split_is_scored_at_its_true_poses(
-    replica_v2: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_test_split_is_scored_at_its_true_poses(replica_v2: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert splatam('run', replica_v2, '--preset', 'quick', *FAST, '--no-evaluate', '--out', tmp_path / 'run') == 0
     assert splatam('evaluate', tmp_path / 'run', '--novel-views') == 0
     assert '1 views without holes, 1 with apart' in capsys.readouterr().out
@@ -132,9 +130,7 @@ def test_compare_prints_a_table_and_draws(finished: Path, tmp_path: Path, capsys
     assert cv2.imread(str(tmp_path / 'plot.png')).std() > 20
 
 
-def test_compare_of_equal_names_shows_their_paths(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_compare_of_equal_names_shows_their_paths(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     same = shutil.copytree(finished, tmp_path / 'tiny')
     assert splatam('compare', finished, same, '--plot', tmp_path / 'plot.svg') == 0
     assert str(same) in capsys.readouterr().out and (tmp_path / 'plot.svg').read_text().startswith('<?xml')
@@ -173,9 +169,7 @@ def test_bench_stops_at_a_preset_that_fails(tmp_path: Path, capsys: pytest.Captu
     assert 'preset quick ended with exit code 2' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ('presets', 'message'), [('quick,quickest', "'quickest'"), ('quick,quick', 'different presets')]
-)
+@pytest.mark.parametrize(('presets', 'message'), [('quick,quickest', "'quickest'"), ('quick,quick', 'different presets')])
 def test_bench_refuses_wrong_presets_before_it_begins(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], presets: str, message: str
 ) -> None:
@@ -195,8 +189,7 @@ def test_render_shows_the_map_from_given_poses(run: RunRecord, tmp_path: Path) -
         T_cam_world = torch.from_numpy(se3.inverse(pose)).float()
         view = make_rasterizer('cpu', 1).render(run.read_map(), run.camera, T_cam_world).images()
         color, depth, silhouette = (
-            cv2.imread(str(out / kind / f'{index:06d}.png'), cv2.IMREAD_UNCHANGED)
-            for kind in ('color', 'depth', 'silhouette')
+            cv2.imread(str(out / kind / f'{index:06d}.png'), cv2.IMREAD_UNCHANGED) for kind in ('color', 'depth', 'silhouette')
         )
         assert np.array_equal(color[..., ::-1], view.rgb)
         assert depth.dtype == np.uint16 and np.abs(depth / 1000 - view.depth_m).max() <= 0.0005 + 1e-6
@@ -249,8 +242,8 @@ def test_refine_makes_a_better_map_and_leaves_the_run_alone(
 
 
 def test_refine_may_add_gaussians(run: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('splatam_core.refinement.GROW_FROM', 20)
-    monkeypatch.setattr('splatam_core.refinement.GROW_EVERY', 20)
+    monkeypatch.setattr('splatam_core.mapping.offline_refinement.GROW_FROM', 20)
+    monkeypatch.setattr('splatam_core.mapping.offline_refinement.GROW_EVERY', 20)
     steps = ['--iterations', 100]
     assert splatam('refine', run.path, '--out', tmp_path / 'same', *steps) == 0
     assert splatam('refine', run.path, '--out', tmp_path / 'grown', *steps, '--densify') == 0
@@ -351,9 +344,7 @@ def test_export_for_the_original_s_programs(run: RunRecord, tmp_path: Path) -> N
     assert params['keyframe_time_indices'].tolist() == keyframes and keyframes[0] == 0
 
 
-def test_export_refuses_what_it_cannot_write(
-    run: RunRecord, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_export_refuses_what_it_cannot_write(run: RunRecord, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'there.ply').write_text('mine')
     for file, message in (
         ('map.obj', "'.obj' files are not written"),

@@ -10,10 +10,11 @@ from rosbags.typesys import Stores, get_typestore
 
 from msg_adapters import camera_info, images, poses
 from msg_adapters.factory import RosbagsMessages
-from splatam_core.camera import PinholeCamera
 from splatam_core.datasets import BagTopics, open_sequence, write_bag
 from splatam_core.errors import CameraError, DatasetError, FrameError
-from splatam_core.types import RgbdFrame, Trajectory
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.geometry.trajectory import Trajectory
+from splatam_core.types import RgbdFrame
 
 STORAGES = ('sqlite3', 'mcap')
 TYPES = get_typestore(Stores.ROS2_JAZZY)

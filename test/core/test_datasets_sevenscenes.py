@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from splatam_core.camera import PinholeCamera
 from splatam_core.datasets import sevenscenes
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.datasets.sevenscenes import DEFAULT_CAMERA
 from splatam_core.errors import DatasetError
+from splatam_core.geometry.camera import PinholeCamera
 
 K_TEXT = '50 0 31.5\n0 51 23.5\n0 0 1\n'
 

@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from splatam_core import se3
-from splatam_core.camera import PinholeCamera
 from splatam_core.config import load_config
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.datasets.room import ROOM_SIZE_M, look_at
 from splatam_core.datasets.synthetic import CAMERA, MOTIONS, SyntheticSequence, measured
 from splatam_core.errors import DatasetError
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
 
 WIDTH = 160
 
@@ -146,9 +146,7 @@ def test_small_frame_is_the_large_one_resized(room):
     small, large = room(frames=1, width=160, noise=False)[0], room(frames=1, width=320, noise=False)[0]
     averaged = cv2.resize(large.rgb, (160, 120), interpolation=cv2.INTER_AREA)
     difference = np.abs(averaged.astype(float) - small.rgb)
-    moved = np.abs(
-        cv2.resize(np.roll(large.rgb, 1, axis=1), (160, 120), interpolation=cv2.INTER_AREA) - small.rgb.astype(float)
-    )
+    moved = np.abs(cv2.resize(np.roll(large.rgb, 1, axis=1), (160, 120), interpolation=cv2.INTER_AREA) - small.rgb.astype(float))
     assert difference.mean() < 4  # grey levels: 16 rays to a pixel against 4
     assert moved.mean() > 1.5 * difference.mean()  # half a small pixel to the side is clearly worse
 

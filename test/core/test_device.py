@@ -13,21 +13,23 @@ import pytest
 import torch
 from second_device import DEVICE, DeviceRasterizer, DeviceTensor, SecondDevice
 
-from splatam_core import densification, mapper, slam, stopwatch
-from splatam_core.backend import Backend
-from splatam_core.camera import PinholeCamera
+from splatam_core import slam, stopwatch
 from splatam_core.config import KeyframeConfig, SlamConfig, TrackingConfig, load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
-from splatam_core.evaluation.images import ImageScores, OriginalScores, ViewScorer
-from splatam_core.export import centres
-from splatam_core.keyframes import KeyframeStore, PosedView
-from splatam_core.ply import read_ply, write_ply
+from splatam_core.device import Backend
+from splatam_core.evaluation.images import ViewScorer
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.images.view import View
+from splatam_core.mapping import densification, mapper
+from splatam_core.mapping.keyframes import KeyframeStore, PosedView
+from splatam_core.mapping.offline_refinement import refine_map
+from splatam_core.maps.export import centres
+from splatam_core.maps.ply import read_ply, write_ply
 from splatam_core.rasterizer import make_rasterizer
-from splatam_core.refinement import refine_map
+from splatam_core.runs.metrics import ImageScores, OriginalScores
 from splatam_core.slam import Slam
 from splatam_core.tracking import make_tracker
 from splatam_core.types import Status
-from splatam_core.view import View
 
 Room = Callable[..., SyntheticSequence]
 
@@ -63,9 +65,7 @@ TOLERANCE = {'splatam': 1e-4, 'realtime': 2e-4}
 
 
 @pytest.mark.parametrize('preset', FEW_STEPS)
-def test_ten_frames_on_the_device_are_those_of_the_host(
-    preset: str, room: Room, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ten_frames_on_the_device_are_those_of_the_host(preset: str, room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing of ten frames touches the host's memory unasked, and from the same state both find the same pose."""
     sequence, host = room(10, WIDTHS[preset], noise=False), Slam(_config(preset))
     with _on_device(monkeypatch):
@@ -159,9 +159,7 @@ def test_no_step_of_tracking_waits_for_the_device(room: Room, monkeypatch: pytes
     assert waits['align', 1] == 4  # one step, the two fits that decide, how many readings there are
 
 
-def test_renders_scores_and_files_come_from_the_device(
-    room: Room, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_renders_scores_and_files_come_from_the_device(room: Room, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The same numbers, to the rounding of sums, and the same bytes."""
     sequence = room(2, WIDTH)
     slam = Slam(_config('realtime'))

@@ -9,18 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from splatam_core import se3
-from splatam_core.camera import PinholeCamera
 from splatam_core.config import DepthConfig
-from splatam_core.evaluation.images import (
-    FrameScores,
-    ImageScores,
-    ViewScorer,
-    mean_scores,
-    original_scores,
-    score_view,
-)
+from splatam_core.evaluation.images import FrameScores, ViewScorer, mean_scores, original_scores, score_view
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.rasterizer import Gaussians, Render, make_rasterizer
+from splatam_core.runs.metrics import ImageScores
 from splatam_core.types import RgbdFrame
 
 ROUND_OFF_DB = 1e-4  # 32-bit colours around 0.5

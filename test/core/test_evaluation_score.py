@@ -16,22 +16,21 @@ import numpy as np
 import pytest
 import torch
 
-from splatam_core import se3
-from splatam_core.camera import PinholeCamera
 from splatam_core.config import load_config
 from splatam_core.errors import FrameError, RunFolderError
-from splatam_core.evaluation.descriptions import DESCRIPTIONS
-from splatam_core.evaluation.frame_table import write_frame_table
-from splatam_core.evaluation.html import html_report
-from splatam_core.evaluation.images import OriginalScores
-from splatam_core.evaluation.metrics import GROUPS, Metrics
-from splatam_core.evaluation.report import DPI, WIDTH_IN, write_report
+from splatam_core.evaluation.report.descriptions import DESCRIPTIONS
+from splatam_core.evaluation.report.frame_table import write_frame_table
+from splatam_core.evaluation.report.html import html_report
+from splatam_core.evaluation.report.picture import DPI, WIDTH_IN, write_report
 from splatam_core.evaluation.score import NovelViews, combine, score_images, score_novel_views, score_trajectory
-from splatam_core.ply import write_ply
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.geometry.trajectory import Trajectory, stamp_from_text
+from splatam_core.maps.ply import write_ply
 from splatam_core.rasterizer import Gaussians, make_rasterizer
-from splatam_core.run_folder import MAP, RunDescription, RunFolder, RunRecord, Source, read_run
-from splatam_core.trajectory import stamp_from_text
-from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status, Trajectory
+from splatam_core.runs.metrics import GROUPS, Metrics, OriginalScores
+from splatam_core.runs.run_folder import MAP, RunDescription, RunFolder, RunRecord, Source, read_run
+from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status
 
 CONFIG = load_config('quick', ['threads=1'])
 STEP_NS, COUNT, LOST = 33_333_333, 9, 4
@@ -162,9 +161,7 @@ def test_samples_go_from_worst_to_best(tmp_path: Path) -> None:
     ('program', 'with_truth', 'with_images'),
     [('splatam run', True, True), ('splatam run', False, True), ('splatam_node', True, False)],
 )
-def test_report_is_drawn_from_whatever_is_known(
-    tmp_path: Path, program: str, with_truth: bool, with_images: bool
-) -> None:
+def test_report_is_drawn_from_whatever_is_known(tmp_path: Path, program: str, with_truth: bool, with_images: bool) -> None:
     sequence = Wall()
     run = make_run(tmp_path, sequence, program=program)
     truth = score_trajectory(run, sequence.ground_truth()) if with_truth else None

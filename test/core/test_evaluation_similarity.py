@@ -37,9 +37,7 @@ def test_as_the_library_that_the_original_uses(size: tuple[int, int]) -> None:
     library = pytest.importorskip('pytorch_msssim')
     a, b = noisy_pair(*size)
     expected = float(library.ms_ssim(a[None], b[None], data_range=1.0))
-    assert ms_ssim(a, b) == pytest.approx(
-        expected, abs=1e-5
-    )  # windows agree to 32 bits, variances to their differences
+    assert ms_ssim(a, b) == pytest.approx(expected, abs=1e-5)  # windows agree to 32 bits, variances to their differences
 
 
 def test_too_small_is_no_score() -> None:
@@ -70,9 +68,7 @@ def test_lpips_absent_names_what_to_install(fresh: pytest.MonkeyPatch) -> None:
         ("def LPIPS(**_): raise OSError('no network')", 'the weights of AlexNet cannot be loaded: no network'),
     ],
 )
-def test_lpips_that_cannot_be_used_says_why(
-    fresh: pytest.MonkeyPatch, tmp_path: Path, source: str, reason: str
-) -> None:
+def test_lpips_that_cannot_be_used_says_why(fresh: pytest.MonkeyPatch, tmp_path: Path, source: str, reason: str) -> None:
     (tmp_path / 'lpips.py').write_text(source)
     fresh.syspath_prepend(tmp_path)
     assert reason in load_lpips()

@@ -5,22 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatam_core import se3
 from splatam_core.errors import RunFolderError
 from splatam_core.evaluation.trajectory import (
-    MAX_TRUTH_GAP_NS,
-    STAMP_ROUNDING_NS,
     RelativePoseError,
     align,
     align_poses,
-    interpolate_centres,
-    interpolate_poses,
     relative_pose_errors,
     splatam_ate_mean_m,
     trajectory_error,
     transformed,
 )
-from splatam_core.types import Trajectory
+from splatam_core.geometry import se3
+from splatam_core.geometry.trajectory import MAX_TRUTH_GAP_NS, STAMP_ROUNDING_NS, Trajectory, interpolate_centres, interpolate_poses
 
 EPOCH_NS = 1_700_000_000_123_456_789
 STEP_NS = 33_333_333

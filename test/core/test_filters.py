@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from splatam_core import filters
+from splatam_core.images import filters
 
 GENERATOR = torch.Generator().manual_seed(0)
 

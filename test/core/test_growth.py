@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from splatam_core import se3
-from splatam_core.backend import HOST
-from splatam_core.camera import PinholeCamera
-from splatam_core.gaussian_map import GaussianMap
-from splatam_core.growth import PULL, SHRINK, ScreenPull, grow
+from splatam_core.device import HOST
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.mapping.adaptive_density import PULL, SHRINK, ScreenPull, grow
+from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.rasterizer import Gaussians, Rates, make_rasterizer
 
 CAMERA = PinholeCamera(32, 24, 30.0, 28.0, 15.5, 11.5)

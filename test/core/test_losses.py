@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from splatam_core.camera import PinholeCamera
 from splatam_core.config import MappingConfig, TrackingConfig
-from splatam_core.losses import mapping_loss, ssim_map, tracking_loss
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.images.ssim import ssim_map
+from splatam_core.images.view import View
+from splatam_core.mapping.loss import mapping_loss
 from splatam_core.rasterizer import Render
-from splatam_core.view import View
+from splatam_core.tracking.loss import tracking_loss
 
 CAMERA = PinholeCamera(6, 4, 5.0, 5.0, 3.0, 2.0)
 L1 = MappingConfig(ssim_weight=0.0)

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from splatam_core.camera import PinholeCamera
 from splatam_core.config import DensificationConfig, KeyframeConfig, MappingConfig, load_config
-from splatam_core.densification import densify, new_gaussians, unexplained
-from splatam_core.gaussian_map import PARAMETERS, GaussianMap
-from splatam_core.keyframes import KeyframeStore, PosedView, draw, is_due, overlaps, select_keyframes
-from splatam_core.mapping import FINAL_FIRST, FINAL_LAST, FINAL_MEANS, prunable, refine, refit
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.images.view import View, unproject
+from splatam_core.mapping.densification import densify, new_gaussians, unexplained
+from splatam_core.mapping.gaussian_map import PARAMETERS, GaussianMap
+from splatam_core.mapping.keyframes import KeyframeStore, PosedView, draw, is_due, overlaps, select_keyframes
+from splatam_core.mapping.optimizers import FINAL_FIRST, FINAL_LAST, FINAL_MEANS, prunable, refine, refit
 from splatam_core.rasterizer import Gaussians, Moments, Rates, Render, Target, joined, make_rasterizer
 from splatam_core.rasterizer.bounds import block_bounds
 from splatam_core.rasterizer.cpu import CpuRasterizer
-from splatam_core.view import View, unproject
 
 CAMERA = PinholeCamera(32, 24, 30.0, 30.0, 15.5, 11.5)
 EYE = torch.eye(4)
@@ -406,9 +406,7 @@ def test_fused_pruning_waits_until_a_share_of_the_map_is_to_go() -> None:
     for faint, left in ((4, 768), (40, 728)):
         gaussian_map = _map(_view())
         gaussian_map.logit_opacities[:faint] = -9.0
-        config = load_config(
-            overrides={'mapping.iterations': 1, 'mapping.optimizer': 'fused', 'mapping.prune_share': 0.02}
-        )
+        config = load_config(overrides={'mapping.iterations': 1, 'mapping.optimizer': 'fused', 'mapping.prune_share': 0.02})
         refine(gaussian_map, [PosedView(_view(), EYE)], make_rasterizer('cpu', 1), config, 10.0, np.random.default_rng(0))
         assert len(gaussian_map) == left
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from splatam_core.errors import MapFileError
-from splatam_core.ply import PROPERTIES, SH_C0, read_ply, write_ply
+from splatam_core.maps.ply import PROPERTIES, SH_C0, read_ply, write_ply
 from splatam_core.rasterizer.base import Gaussians
 
 STANDARD = [  # the order of the original 3D Gaussian splatting exporter, degree 0

@@ -11,9 +11,9 @@ import rasterizer_scenes as scenes
 import torch
 from rasterizer_scenes import Scene
 
-from splatam_core import se3
-from splatam_core.camera import PinholeCamera
 from splatam_core.errors import RasterizerError
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.rasterizer import Gaussians, Moments, Rasterizer, Rates, Target, make_rasterizer
 from splatam_core.rasterizer.base import MAX_ALPHA, MIN_ALPHA
 from splatam_core.rasterizer.reference import ReferenceRasterizer
@@ -151,8 +151,7 @@ def test_reference_gradients_equal_finite_differences(scene: Scene) -> None:
     generator = torch.Generator().manual_seed(3)
     for _ in range(5):
         direction = {
-            name: torch.randn(gradient.shape, generator=generator, dtype=torch.float64)
-            for name, gradient in gradients.items()
+            name: torch.randn(gradient.shape, generator=generator, dtype=torch.float64) for name, gradient in gradients.items()
         }
         slope = sum((direction[name] * gradient).sum() for name, gradient in gradients.items())
         # 1e-8: no pixel crosses a threshold in so small a step, and float64 still resolves the difference to 1e-6.
@@ -199,7 +198,10 @@ def test_one_ellipse_by_hand(backend: str, threads: int) -> None:
     cam, z = PinholeCamera(41, 31, 40.0, 40.0, 20.0, 15.0), 2.0
     turn = math.radians(15.0)
     needle = Gaussians(
-        torch.tensor([[0.0, 0.0, z]]), torch.log(torch.tensor([[0.3, 0.05, 0.01]])), torch.tensor([0.0]), torch.ones(1, 3),
+        torch.tensor([[0.0, 0.0, z]]),
+        torch.log(torch.tensor([[0.3, 0.05, 0.01]])),
+        torch.tensor([0.0]),
+        torch.ones(1, 3),
         rotations=2.0 * torch.tensor([[math.cos(turn), 0.0, 0.0, math.sin(turn)]]),  # any length will do
     )
     roll = torch.from_numpy(se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, turn]))).float()
@@ -289,8 +291,7 @@ def test_threads_do_not_change_the_image_and_repeats_do_not_change_gradients(nam
     scene = SCENES[name]
     weights = torch.randn(5, 25, 33, generator=torch.Generator().manual_seed(4))
     runs = [
-        scenes.render_with_gradients(make_rasterizer('cpu', threads), scene, torch.float32, weights)
-        for threads in (1, 2, 2, 5)
+        scenes.render_with_gradients(make_rasterizer('cpu', threads), scene, torch.float32, weights) for threads in (1, 2, 2, 5)
     ]
     for image, _ in runs[1:]:
         assert torch.equal(image, runs[0][0])

@@ -21,10 +21,10 @@ from rasterizer_scenes import Scene
 from splatam_core.config import load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
 from splatam_core.errors import RasterizerError
-from splatam_core.gaussian_map import GaussianMap
+from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.rasterizer import Gaussians, Moments, Rates, Target, make_rasterizer
-from splatam_core.rasterizer.triton import TritonRasterizer
-from splatam_core.rasterizer.triton_lists import Capacity
+from splatam_core.rasterizer.triton.lists import Capacity
+from splatam_core.rasterizer.triton.rasterizer import TritonRasterizer
 from splatam_core.slam import Slam
 from splatam_core.types import Status
 
@@ -217,7 +217,7 @@ def _python(code: str, *arguments: str, **environment: str) -> str:
 def test_tensors_of_the_cpu_need_the_interpreter() -> None:
     said = _python("""
 import torch
-from splatam_core.camera import PinholeCamera
+from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.rasterizer import Gaussians, make_rasterizer
 try:
     g = Gaussians(torch.zeros(1, 3), torch.zeros(1, 1), torch.zeros(1), torch.zeros(1, 3))
@@ -247,7 +247,7 @@ import sys
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from splatam_core.rasterizer import triton_kernels as kernels
+from splatam_core.rasterizer.triton import kernels
 
 POINTERS = {
     'order': 'i64', 'ends': 'i64', 'starts': 'i64', 'slots': 'i64', 'total': 'i64', 'readings': 'i64', 'rects': 'i32',

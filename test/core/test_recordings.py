@@ -11,8 +11,9 @@ import pytest
 from splatam_core.config import load_config
 from splatam_core.datasets import open_sequence
 from splatam_core.evaluation.trajectory import trajectory_error
+from splatam_core.geometry.trajectory import Trajectory
 from splatam_core.slam import Slam
-from splatam_core.types import Status, Trajectory
+from splatam_core.types import Status
 
 
 @pytest.mark.parametrize(
@@ -27,9 +28,7 @@ from splatam_core.types import Status, Trajectory
         ('realtime', 640, 'tum_fr1_rpy', 0.025),  # renders for tracking at half size
     ],
 )
-def test_tracks_the_first_frames(
-    preset: str, width: int, name: str, rmse_m: float, recording: Callable[[str], Path]
-) -> None:
+def test_tracks_the_first_frames(preset: str, width: int, name: str, rmse_m: float, recording: Callable[[str], Path]) -> None:
     """Every frame."""
     sequence = open_sequence(str(recording(name)), width=width, max_frames=40)
     slam = Slam(load_config(preset, ['threads=1']))

@@ -14,13 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatam_core import environment, se3
-from splatam_core.camera import PinholeCamera
 from splatam_core.config import load_config
 from splatam_core.errors import RunFolderError
-from splatam_core.evaluation.metrics import Metrics, StageStatistics
-from splatam_core.ply import read_ply
-from splatam_core.run_folder import RunDescription, RunFolder, Source, read_run, run_metrics
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.maps.ply import read_ply
+from splatam_core.runs import provenance
+from splatam_core.runs.metrics import Metrics, StageStatistics
+from splatam_core.runs.run_folder import RunDescription, RunFolder, Source, read_run, run_metrics
 from splatam_core.slam import Slam
 from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status
 
@@ -86,18 +87,16 @@ def test_run_json_says_what_ran_where(tmp_path: Path) -> None:
     assert {'system', 'processor', 'cores', 'memory_mb', 'gpu'} == information['machine'].keys()
     assert 'rasterizer' in information['backend']
     assert information['versions']['torch'] and information['versions']['python']
-    assert information['commit'] == environment.commit()
+    assert information['commit'] == provenance.commit()
     assert re.fullmatch(r'\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00', information['started'])
 
 
 def test_commit_is_the_repository_s_or_unknown() -> None:
     root = Path(__file__).resolve().parents[2]
     git = subprocess.run(['git', '-C', root, 'rev-parse', 'HEAD'], capture_output=True, text=True)
-    tracked = subprocess.run(
-        ['git', '-C', root, 'ls-files', '--error-unmatch', environment.__file__], capture_output=True
-    )
+    tracked = subprocess.run(['git', '-C', root, 'ls-files', '--error-unmatch', provenance.__file__], capture_output=True)
     expected = git.stdout.strip() if git.returncode == tracked.returncode == 0 else None
-    commit = environment.commit()
+    commit = provenance.commit()
     assert (None if commit is None else commit.removesuffix('-dirty')) == expected
 
 

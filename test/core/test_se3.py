@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splatam_core import se3
+from splatam_core.geometry import se3
 
 angles = st.floats(-3.0, 3.0)  # a rotation vector shorter than pi, so that log is its inverse
 twists = st.tuples(*[st.floats(-5, 5)] * 3, *[angles] * 3).map(np.array).filter(lambda t: np.linalg.norm(t[3:]) < 3.1)

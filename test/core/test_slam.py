@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 import torch
 
-from splatam_core import se3
-from splatam_core.camera import PinholeCamera
 from splatam_core.config import KeyframeConfig, TrackingConfig, load_config
 from splatam_core.datasets import open_sequence
 from splatam_core.errors import ConfigError, FrameError, SplatamError
-from splatam_core.keyframes import PosedView, draw
-from splatam_core.motion import MotionModel
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.images.view import View
+from splatam_core.mapping.keyframes import PosedView, draw
 from splatam_core.rasterizer import Render, make_rasterizer
 from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.slam import Slam
 from splatam_core.tracking import make_tracker
 from splatam_core.tracking.features import pose_by_features
+from splatam_core.tracking.motion import MotionModel
 from splatam_core.types import FrameResult, RgbdFrame, Status
-from splatam_core.view import View
 
 WIDTH = 96  # a frame then takes some 50 ms
 
@@ -42,9 +42,7 @@ def _slam(*overrides: str) -> Slam:
 
 def _covered(frame: RgbdFrame, stamp_ns: int) -> RgbdFrame:
     """A hand on the lens: dark, and nothing but very near readings."""
-    return dataclasses.replace(
-        frame, stamp_ns=stamp_ns, rgb=np.zeros_like(frame.rgb), depth_m=np.full_like(frame.depth_m, 0.3)
-    )
+    return dataclasses.replace(frame, stamp_ns=stamp_ns, rgb=np.zeros_like(frame.rgb), depth_m=np.full_like(frame.depth_m, 0.3))
 
 
 def test_tracks_every_frame_of_the_room(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
@@ -199,9 +197,7 @@ def test_reference_and_cpu_rasterizers_run_the_same_slam() -> None:
     sequence = open_sequence('synthetic', width=32, max_frames=2)
     poses = []
     for backend in ('cpu', 'reference'):
-        slam = _slam(
-            f'rasterizer={backend}', 'tracking.method=render_and_compare', 'tracking.iterations=5', 'mapping.iterations=3'
-        )
+        slam = _slam(f'rasterizer={backend}', 'tracking.method=render_and_compare', 'tracking.iterations=5', 'mapping.iterations=3')
         poses.append([slam.process(sequence[i]).T_world_cam for i in range(2)][1])
     np.testing.assert_allclose(poses[0], poses[1], atol=1e-4)
 
@@ -370,7 +366,7 @@ def test_views_are_fitted_and_kept_at_the_size_of_mapping(
         fitted.extend(posed.view.camera.width for posed in window)
         return draw(window, config, rng)
 
-    monkeypatch.setattr('splatam_core.mapping.draw', noted)
+    monkeypatch.setattr('splatam_core.mapping.optimizers.draw', noted)
     slam = _slam(f'mapping.optimizer={optimizer}', 'mapping.scale=0.75', 'mapping.max_width=60', 'keyframes.every=2')
     results = [slam.process(frame) for frame in room[0][:6]]
     assert all(result.T_world_cam is not None for result in results) and set(fitted) == {60}
@@ -402,9 +398,7 @@ def test_a_reading_between_the_pixels_of_the_grid_starts_no_map(room: tuple[list
     assert slam.process(frames[1]).status is Status.INITIALIZED and len(slam.state().keyframes) == 1
 
 
-def test_few_gaussians_are_added_between_the_frames_whose_turn_it_is(
-    room: tuple[list[RgbdFrame], list[np.ndarray]]
-) -> None:
+def test_few_gaussians_are_added_between_the_frames_whose_turn_it_is(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
     """On every third frame, and where less of the view is sure than asked for: here never, and always."""
     frames, _ = room
     for when_unsure, grows in ((0.0, [False, False, True, False, False]), (1.0, [True] * 5)):

@@ -7,14 +7,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from splatam_core import se3
 from splatam_core.config import SlamConfig, TrackingConfig, load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
+from splatam_core.geometry import se3
+from splatam_core.images.view import View
 from splatam_core.rasterizer import rasterizer_for
 from splatam_core.slam import Slam
 from splatam_core.tracking import make_tracker
 from splatam_core.types import Status
-from splatam_core.view import View
 
 Room = Callable[..., SyntheticSequence]
 

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from splatam_core import _native, se3
-from splatam_core.backend import HOST
+from splatam_core import _native
 from splatam_core.config import TrackingConfig, load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
+from splatam_core.device import HOST
+from splatam_core.geometry import se3
+from splatam_core.images.view import View
 from splatam_core.rasterizer import make_rasterizer
 from splatam_core.slam import Slam
 from splatam_core.tracking import AlignmentTracker, TorchAligner, make_tracker
-from splatam_core.view import View
 
 EDGE = 0.05
 Image = np.ndarray

@@ -7,18 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatam_core import se3
 from splatam_core.cli import main
 from splatam_core.config import TrackingConfig, load_config
 from splatam_core.datasets import open_sequence
+from splatam_core.datasets.known_poses import FramesWithTruth
 from splatam_core.errors import ConfigError, FrameError
+from splatam_core.geometry import se3
+from splatam_core.geometry.trajectory import Trajectory
+from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians, Rasterizer, Render, make_rasterizer
-from splatam_core.run_folder import read_run
+from splatam_core.runs.run_folder import read_run
 from splatam_core.slam import Slam
 from splatam_core.tracking import make_tracker
-from splatam_core.truth import FramesWithTruth
-from splatam_core.types import RgbdFrame, Status, Trajectory
-from splatam_core.view import View
+from splatam_core.types import RgbdFrame, Status
 
 WIDTH = 64
 QUICK = ['threads=1', 'mapping.iterations=3', 'mapping.every=1']
@@ -103,9 +104,7 @@ class Counting:
         return self._rasterizer.render(gaussians, *view)
 
 
-@pytest.mark.parametrize(
-    ('extend_above_m', 'iterations', 'renders'), [(0.0, 5, 6), (1e-4, 5, 11), (1.0, 5, 6), (1e-4, 0, 1)]
-)
+@pytest.mark.parametrize(('extend_above_m', 'iterations', 'renders'), [(0.0, 5, 6), (1e-4, 5, 11), (1.0, 5, 6), (1e-4, 0, 1)])
 def test_steps_are_doubled_once_where_depth_stays_off(extend_above_m: float, iterations: int, renders: int) -> None:
     """Every step renders, and so does the last pose; noise alone keeps the depth error above a tenth of a millimetre."""
     sequence = open_sequence('synthetic', width=WIDTH, max_frames=1)

@@ -7,8 +7,8 @@ import threading
 import numpy as np
 import pytest
 
-from splatam_core.camera import PinholeCamera
 from splatam_core.errors import FrameError
+from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status
 from splatam_core.worker import SlamWorker, WorkerStopped
 

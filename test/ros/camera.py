@@ -62,9 +62,7 @@ class Camera:
     def wait_matched(self) -> None:
         self._graph.spin_until(lambda: self.is_matched)
 
-    def send(
-        self, frame: RgbdFrame, *, depth_delay_ns: int = 0, only: Sequence[str] = STREAMS, **changes: Any
-    ) -> None:
+    def send(self, frame: RgbdFrame, *, depth_delay_ns: int = 0, only: Sequence[str] = STREAMS, **changes: Any) -> None:
         """Send a frame's messages, or some of them; ``rgb__encoding='x'`` changes a field of one."""
         messages = self.messages(frame, frame.stamp_ns + depth_delay_ns)
         for name, value in changes.items():
@@ -113,9 +111,7 @@ def info_message(frame: RgbdFrame) -> CameraInfo:
 class Live:
     """A node at work, fed frame by frame by a camera; each frame is waited for until it is done with."""
 
-    def __init__(
-        self, graph: Graph, *ros_arguments: str, camera_class: type[Camera] = Camera, **parameters: Any
-    ) -> None:
+    def __init__(self, graph: Graph, *ros_arguments: str, camera_class: type[Camera] = Camera, **parameters: Any) -> None:
         self.graph = graph
         self.camera = camera_class(graph)
         self.done = graph.collect(Header, '/splatam/processed')

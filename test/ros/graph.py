@@ -60,14 +60,10 @@ def reserve_domain() -> tuple[int, IO[bytes]]:
 class Process:
     """A process under test; what it says goes into a file."""
 
-    def __init__(
-        self, command: Sequence[str], environment: dict[str, str], log: Path, stdin: int = subprocess.DEVNULL
-    ) -> None:
+    def __init__(self, command: Sequence[str], environment: dict[str, str], log: Path, stdin: int = subprocess.DEVNULL) -> None:
         self._log = log
         with log.open('wb') as file:
-            self._process = subprocess.Popen(
-                command, cwd=ROOT, env=environment, stdin=stdin, stdout=file, stderr=subprocess.STDOUT
-            )
+            self._process = subprocess.Popen(command, cwd=ROOT, env=environment, stdin=stdin, stdout=file, stderr=subprocess.STDOUT)
 
     @property
     def text(self) -> str:
@@ -114,9 +110,7 @@ class Process:
             self._process.wait()
 
 
-def wait_until(
-    condition: Callable[[], object], timeout_s: float = TIMEOUT_S, explain: Callable[[], str] = lambda: ''
-) -> None:
+def wait_until(condition: Callable[[], object], timeout_s: float = TIMEOUT_S, explain: Callable[[], str] = lambda: '') -> None:
     deadline_s = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline_s, f'not so within {timeout_s} s. {explain()}'
@@ -139,17 +133,15 @@ class Graph:
     def start(self, *command: str, stdin: int = subprocess.DEVNULL) -> Process:
         variables = environment(self.domain, self.folder)
         variables.pop('FASTRTPS_DEFAULT_PROFILES_FILE')  # they must find it themselves
-        process = Process(
-            [sys.executable, *command], variables, self.folder / f'process_{len(self._processes)}.log', stdin
-        )
+        process = Process([sys.executable, *command], variables, self.folder / f'process_{len(self._processes)}.log', stdin)
         self._processes.append(process)
         return process
 
     def play(self, *arguments: str, stdin: int = subprocess.DEVNULL) -> Process:
-        return self.start('-m', 'splatam_ros.bag_player', *arguments, stdin=stdin)
+        return self.start('-m', 'splatam_ros.player.main', *arguments, stdin=stdin)
 
     def run_node(self, *ros_arguments: str, **parameters: Any) -> Process:
-        return self.start('-m', 'splatam_ros.main', *node_arguments(*ros_arguments, **parameters))
+        return self.start('-m', 'splatam_ros.node.main', *node_arguments(*ros_arguments, **parameters))
 
     # --- the test's own node ---
 

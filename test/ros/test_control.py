@@ -13,12 +13,12 @@ from graph import Graph
 
 from splatam_core.config import load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
-from splatam_core.ply import read_ply, write_ply
-from splatam_core.run_folder import read_run
+from splatam_core.geometry.trajectory import pose_line
+from splatam_core.maps.ply import read_ply, write_ply
+from splatam_core.runs.run_folder import read_run
 from splatam_core.slam import Slam
-from splatam_core.trajectory import pose_line
 from splatam_core.types import RgbdFrame
-from splatam_ros.gate import Gate
+from splatam_ros.node.gate import Gate
 
 SECOND = 10**9
 # Where a camera that does not move may be found, at 64 pixels width and a handful of steps: a pixel is 4 cm at 2.5 m.

@@ -18,11 +18,11 @@ from msg_adapters import camera_info
 from msg_adapters.camera_info import CameraParameters
 from msg_adapters.factory import RclpyMessages
 from splatam_core.datasets.synthetic import SyntheticSequence
-from splatam_ros.diagnosis import why_no_frames
-from splatam_ros.gate import Gate
-from splatam_ros.inputs import Input
-from splatam_ros.intake import Intake
-from splatam_ros.parameters import NODE_SETTINGS, NodeOptions
+from splatam_ros.node.frame_assembler import Intake
+from splatam_ros.node.gate import Gate
+from splatam_ros.node.input_watchdog import why_no_frames
+from splatam_ros.node.parameters import NODE_SETTINGS, NodeOptions
+from splatam_ros.subscription import Input
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 STREAMS = ((CameraInfo, '/rgb/camera_info'), (Image, '/rgb/image'), (Image, '/depth/image'))

@@ -16,8 +16,8 @@ from std_msgs.msg import Header
 
 from msg_adapters import stamps
 from splatam_core.datasets.synthetic import SyntheticSequence
-from splatam_core.ply import read_ply
-from splatam_core.run_folder import read_run
+from splatam_core.maps.ply import read_ply
+from splatam_core.runs.run_folder import read_run
 from splatam_core.types import RgbdFrame
 
 SECOND = 10**9
@@ -237,7 +237,7 @@ def slow(source, target):
         time.sleep(60)
     replace(source, target)
 os.replace = slow
-from splatam_ros.main import main
+from splatam_ros.node.main import main
 sys.exit(main(sys.argv[1:]))
 """
 

@@ -23,16 +23,16 @@ from std_msgs.msg import Header
 
 from msg_adapters import point_clouds, poses, stamps
 from msg_adapters.factory import RosbagsMessages
-from splatam_core import se3
 from splatam_core.config import load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
 from splatam_core.errors import ConfigError
+from splatam_core.geometry import se3
 from splatam_core.slam import Slam
 from splatam_core.types import Status
-from splatam_ros.frames import T_BODY_OPTICAL, Frames, parse_pose
-from splatam_ros.parameters import NODE_SETTINGS, NodeOptions
+from splatam_ros.frames.buffer import TransformTree
+from splatam_ros.frames.rep105 import T_BODY_OPTICAL, Frames, parse_pose
+from splatam_ros.node.parameters import NODE_SETTINGS, NodeOptions
 from splatam_ros.throttled_warnings import ThrottledWarnings
-from splatam_ros.transforms import TransformTree
 
 # A camera 20 cm ahead of the robot's centre and 50 cm above it, looking forward and 0.2 rad down.
 CAMERA_IN_BASE = f'0.2 0 0.5 {-np.pi / 2 - 0.2} 0 {-np.pi / 2}'
@@ -72,8 +72,7 @@ def links(messages: list[Any]) -> dict[tuple[str, str], dict[int, np.ndarray]]:
 
 def by_stamp(messages: list[Any]) -> dict[int, np.ndarray]:
     return {
-        stamps.message_stamp_ns(message): poses.pose_matrix(getattr(message.pose, 'pose', message.pose))
-        for message in messages
+        stamps.message_stamp_ns(message): poses.pose_matrix(getattr(message.pose, 'pose', message.pose)) for message in messages
     }
 
 
@@ -96,9 +95,7 @@ def assert_close(found: np.ndarray, expected: np.ndarray) -> None:
     np.testing.assert_allclose(found, expected, atol=EXACT)
 
 
-def test_an_upright_robot_with_its_extrinsic_as_a_parameter(
-    graph: Graph, tf_message: type, frames: SyntheticSequence
-) -> None:
+def test_an_upright_robot_with_its_extrinsic_as_a_parameter(graph: Graph, tf_message: type, frames: SyntheticSequence) -> None:
     camera, ears = Camera(graph), Ears(graph, tf_message)
     clouds = graph.collect(PointCloud2, '/splatam/map/points', LATCHED)
     node = run_node(
@@ -220,9 +217,7 @@ def test_without_base_and_without_odom_frame_the_camera_is_in_the_map(
     graph: Graph, tf_message: type, frames: SyntheticSequence
 ) -> None:
     camera, ears = Camera(graph), Ears(graph, tf_message)
-    node = run_node(
-        graph, queue_policy='all', camera_frame='eye', world_up='z_up', map_frame='world', odom_frame='drifting'
-    )
+    node = run_node(graph, queue_policy='all', camera_frame='eye', world_up='z_up', map_frame='world', odom_frame='drifting')
     graph.spin_until(lambda: graph.node.count_publishers('/tf'), explain=lambda: node.text)
     sent = process(graph, node, camera, ears, list(frames)[:3])
     graph.spin_until(lambda: sent[-1] in ears.moving.get(('drifting', 'eye'), {}))
@@ -236,7 +231,7 @@ def test_without_base_and_without_odom_frame_the_camera_is_in_the_map(
 WITHOUT_TF2 = """
 import sys
 sys.modules['tf2_msgs'] = None
-from splatam_ros.main import main
+from splatam_ros.node.main import main
 sys.exit(main(sys.argv[1:]))
 """
 
@@ -336,16 +331,13 @@ def test_slam_starts_from_the_prior(robot: Robot) -> None:
         slam = Slam(load_config('quick', FAST), prior)
         results = [slam.process(frame) for frame in robot.frames]
         errors_m = [
-            np.inf if result.status is Status.LOST else robot.error_m(result.stamp_ns, result.T_world_cam)
-            for result in results
+            np.inf if result.status is Status.LOST else robot.error_m(result.stamp_ns, result.T_world_cam) for result in results
         ]
         assert max(errors_m) < TRACKED_M if is_tracked else max(errors_m) > ASTRAY_M, errors_m
 
 
 @pytest.mark.parametrize('source', ['tf', 'topic'])
-def test_odometry_is_where_tracking_starts_and_is_corrected(
-    graph: Graph, tf_message: type, robot: Robot, source: str
-) -> None:
+def test_odometry_is_where_tracking_starts_and_is_corrected(graph: Graph, tf_message: type, robot: Robot, source: str) -> None:
     camera, ears = Camera(graph), Ears(graph, tf_message)
     wheels = graph.publisher(tf_message, '/tf', TF) if source == 'tf' else graph.publisher(Odometry, '/odom')
     slam = {f'slam.{name}': value for name, value in FAST.items()}
@@ -381,9 +373,7 @@ def test_odometry_is_where_tracking_starts_and_is_corrected(
     assert set(ears.moving.get(('odom', 'base_link'), {})) <= set(robot.stamps_ns[::2])
 
 
-def test_without_odometry_constant_velocity_and_one_warning(
-    graph: Graph, tf_message: type, frames: SyntheticSequence
-) -> None:
+def test_without_odometry_constant_velocity_and_one_warning(graph: Graph, tf_message: type, frames: SyntheticSequence) -> None:
     camera, ears = Camera(graph), Ears(graph, tf_message)
     wheels = graph.publisher(Odometry, '/odom')
     node = run_node(graph, queue_policy='all', odom__source='topic', odom__max_wait=0.05)

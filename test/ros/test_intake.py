@@ -17,14 +17,15 @@ from sensor_msgs.msg import CameraInfo, RegionOfInterest
 
 from msg_adapters import camera_info, images, poses
 from msg_adapters.camera_info import CameraParameters
-from splatam_core.camera import CameraCalibration, FrameFactory
 from splatam_core.config import load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
+from splatam_core.geometry.camera import CameraCalibration
+from splatam_core.images.rectification import FrameFactory
 from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame
-from splatam_ros.gate import Gate
-from splatam_ros.intake import Intake
-from splatam_ros.parameters import NODE_SETTINGS, NodeOptions
+from splatam_ros.node.frame_assembler import Intake
+from splatam_ros.node.gate import Gate
+from splatam_ros.node.parameters import NODE_SETTINGS, NodeOptions
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 SECOND = 10**9
@@ -97,9 +98,7 @@ COEFFICIENTS = [
 
 
 @pytest.mark.parametrize(('model', 'd'), COEFFICIENTS)
-def test_images_are_rectified_unless_they_are_already(
-    make_bench: Callable[..., Bench], model: str, d: list[float]
-) -> None:
+def test_images_are_rectified_unless_they_are_already(make_bench: Callable[..., Bench], model: str, d: list[float]) -> None:
     rgb = np.dstack([np.tile(np.arange(64, dtype=np.uint8) * 4, (48, 1))] * 3)
     message = info(distortion_model=model, d=d, p=np.array([50.0, 0, 30, 0, 0, 50, 20, 0, 0, 0, 1, 0]))
     (rectified,) = make_bench().feed(SECOND, info=message, rgb=rgb)

@@ -16,18 +16,16 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from splatam_core.resources import config_dir
-from splatam_ros import parameters
 from splatam_ros.cameras import CAMERAS
 from splatam_ros.interface import INPUTS
-from splatam_ros.parameters import NODE_SETTINGS
+from splatam_ros.node import parameters
+from splatam_ros.node.parameters import NODE_SETTINGS
 
 LAUNCH = ROOT / 'splatam_ros' / 'launch'
 
 
 @pytest.mark.parametrize('path', sorted((config_dir() / 'ros').glob('*.yaml')), ids=lambda path: path.stem)
-def test_parameter_files_hold_known_names_and_allowed_values(
-    graph: Graph, path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_parameter_files_hold_known_names_and_allowed_values(graph: Graph, path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     context = Context()
     rclpy.init(context=context, domain_id=graph.domain)
     node = Node(
@@ -105,9 +103,7 @@ def test_launch_files_use_arguments_that_they_declare(describe: Callable[[str], 
 
 
 @pytest.mark.parametrize('camera', ['', *CAMERAS])
-def test_launch_files_remap_inputs_and_set_parameters_that_exist(
-    describe: Callable[[str], Recorder], camera: str
-) -> None:
+def test_launch_files_remap_inputs_and_set_parameters_that_exist(describe: Callable[[str], Recorder], camera: str) -> None:
     if camera:
         (action,) = describe('camera.launch.py').find('OpaqueFunction')
         nodes = action.kwargs['function']({'camera': camera})

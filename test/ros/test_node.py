@@ -28,8 +28,8 @@ from msg_adapters import images, point_clouds, poses, stamps
 from splatam_core.config import load_config
 from splatam_core.datasets.convert import write_bag
 from splatam_core.datasets.synthetic import SyntheticSequence
-from splatam_core.ply import read_ply
-from splatam_core.run_folder import read_run
+from splatam_core.maps.ply import read_ply
+from splatam_core.runs.run_folder import read_run
 from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame
 
@@ -177,7 +177,7 @@ def process(self, frame):
         time.sleep(0.01)
     return works(self, frame)
 Slam.process = process
-from splatam_ros.main import main
+from splatam_ros.node.main import main
 sys.exit(main(sys.argv[2:]))
 """
 
@@ -289,7 +289,7 @@ def process(self, frame):
         raise ZeroDivisionError('something nobody thought of')
     return works(self, frame)
 Slam.process = process
-from splatam_ros.main import main
+from splatam_ros.node.main import main
 sys.exit(main(sys.argv[1:]))
 """
 
@@ -367,9 +367,7 @@ def test_bad_input_is_a_warning_each_and_the_node_goes_on(graph: Graph, frames: 
 
 
 def nan_depth(frame: RgbdFrame) -> Any:
-    return images.depth_message(MAKE, frame.depth_m, 0, '').data.__class__(
-        'B', np.full_like(frame.depth_m, np.nan).tobytes()
-    )
+    return images.depth_message(MAKE, frame.depth_m, 0, '').data.__class__('B', np.full_like(frame.depth_m, np.nan).tobytes())
 
 
 def test_a_camera_that_changes_is_refused_and_the_first_one_goes_on(graph: Graph, frames: SyntheticSequence) -> None:
@@ -405,9 +403,7 @@ def test_a_best_effort_camera_is_heard(graph: Graph, frames: SyntheticSequence) 
     graph.spin_until(send, explain=lambda: node.text)
 
 
-def test_frames_whose_stamps_differ_pair_and_the_last_does_not_wait_for_ever(
-    graph: Graph, frames: SyntheticSequence
-) -> None:
+def test_frames_whose_stamps_differ_pair_and_the_last_does_not_wait_for_ever(graph: Graph, frames: SyntheticSequence) -> None:
     camera, tracked = Camera(graph), graph.collect(PoseStamped, '/splatam/pose')
     node = run_node(graph, queue_policy='all')
     camera.wait_matched()

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatam_core import se3
+from splatam_core.geometry import se3
 from splatam_core.types import FrameResult, StageTimings, Status
-from splatam_ros.frames import Located
-from splatam_ros.odometry import UNKNOWN_VARIANCE, MotionEstimator
-from splatam_ros.outputs import PathHistory
+from splatam_ros.frames.covariance import UNKNOWN_VARIANCE, MotionEstimator
+from splatam_ros.frames.rep105 import Located
+from splatam_ros.node.outputs import PathHistory
 
 POSITION_M, ORIENTATION_RAD = 0.02, 0.01
 T_BODY_CAMERA = se3.exp(np.array([0.3, 0, 0.5, 0, 0.4, 0]))

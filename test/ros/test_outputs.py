@@ -33,11 +33,11 @@ from splatam_core.resources import config_dir
 from splatam_core.slam import Slam
 from splatam_core.types import MapSnapshot, RenderedView, RgbdFrame, Status
 from splatam_ros import interface
-from splatam_ros.diagnostics import InputSample, Sample, reports
-from splatam_ros.geometry import Geometry
-from splatam_ros.outputs import OUTPUTS, Outputs
-from splatam_ros.parameters import NODE_SETTINGS, NodeOptions
-from splatam_ros.recording import message_class
+from splatam_ros.frames.geometry import Geometry
+from splatam_ros.node.diagnostics import InputSample, Sample, reports
+from splatam_ros.node.outputs import OUTPUTS, Outputs
+from splatam_ros.node.parameters import NODE_SETTINGS, NodeOptions
+from splatam_ros.player.recording import message_class
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -64,9 +64,7 @@ class Diagnostics:
         return {item.key: item.value for item in self[name].values}
 
 
-def test_a_covered_camera_is_lost_in_silence_and_found_again(
-    graph: Graph, tf_message: type, frames: SyntheticSequence
-) -> None:
+def test_a_covered_camera_is_lost_in_silence_and_found_again(graph: Graph, tf_message: type, frames: SyntheticSequence) -> None:
     camera, diagnostics = Camera(graph), Diagnostics(graph)
     done = graph.collect(Header, '/splatam/processed')
     heard = {
@@ -291,9 +289,7 @@ def recorded_qos(offered: QoSProfile) -> Qos:
                QosLiveliness.AUTOMATIC, none, False)  # fmt: skip
 
 
-def test_what_was_recorded_of_the_node_plays_back(
-    graph: Graph, tf_message: type, bag: Path, frames: SyntheticSequence
-) -> None:
+def test_what_was_recorded_of_the_node_plays_back(graph: Graph, tf_message: type, bag: Path, frames: SyntheticSequence) -> None:
     """Every output, raw, by the types and QoS that the graph tells; read by another library, and played again."""
     node = run_node(graph, queue_policy='all', exit_on_publisher_end=True, publish_rate__path=0.0,
                     publish_rate__cloud=0.0)  # fmt: skip

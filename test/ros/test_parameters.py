@@ -16,9 +16,9 @@ from rclpy.parameter import Parameter
 
 from splatam_core.config import SlamConfig, load_config, settings
 from splatam_core.errors import ConfigError
-from splatam_ros import parameters
-from splatam_ros.parameters import NODE_SETTINGS, NodeOptions
-from splatam_ros.reconfiguration import Reconfiguration
+from splatam_ros.node import parameters
+from splatam_ros.node.parameters import NODE_SETTINGS, NodeOptions
+from splatam_ros.node.reconfiguration import Reconfiguration
 
 MakeNode = Callable[..., Node]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from graph import ROOT
 
-from splatam_ros.bag_player import make_parser
+from splatam_ros.player.main import make_parser
 
 TEXT = (ROOT / 'docs' / 'player.md').read_text()
 

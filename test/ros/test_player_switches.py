@@ -102,9 +102,7 @@ def test_rate_one_keeps_time_and_loses_nothing(graph: Graph, camera_bag: Path) -
 @pytest.mark.parametrize('rate', ['0.5', '2'])
 def test_the_rate_scales_time(graph: Graph, bag: Path, rate: str) -> None:
     sent_ns: list[int] = []
-    graph.node.create_subscription(
-        Image, RGB, lambda data, info: sent_ns.append(info['source_timestamp']), ALL_KEPT, raw=True
-    )
+    graph.node.create_subscription(Image, RGB, lambda data, info: sent_ns.append(info['source_timestamp']), ALL_KEPT, raw=True)
     finish(graph, graph.play(str(bag), '--topics', RGB, '--rate', rate))
     seconds = (sent_ns[-1] - sent_ns[0]) / 1e9
     assert seconds == pytest.approx(11 / 30 / float(rate), abs=0.05)  # a busy core may delay the last message
@@ -323,9 +321,7 @@ rclpy.spin(node)
 """
 
 
-def test_the_node_gets_every_frame_of_a_camera_however_fast_they_are_read(
-    graph: Graph, camera_bag: Path, tmp_path: Path
-) -> None:
+def test_the_node_gets_every_frame_of_a_camera_however_fast_they_are_read(graph: Graph, camera_bag: Path, tmp_path: Path) -> None:
     info = graph.publisher(CameraInfo, INFO, LATCHED)
     message = CameraInfo(width=640, height=480, distortion_model='plumb_bob')
     message.k[0] = message.k[4] = message.p[0] = message.p[5] = 500.0

@@ -30,9 +30,7 @@ def test_the_page_is_what_the_code_says(capsys: pytest.CaptureFixture[str]) -> N
     assert TOOL.main(['--check']) == 0, capsys.readouterr().err
 
 
-def test_a_stale_page_is_noticed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_stale_page_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     page = tmp_path / 'ros.md'
     page.write_text(TOOL.PAGE.read_text().replace('`queue_size`', '`queue_length`'))
     monkeypatch.setattr(TOOL, 'PAGE', page)

@@ -8,10 +8,10 @@ import time
 import numpy as np
 import pytest
 
-from splatam_core import se3
 from splatam_core.errors import ConfigError
-from splatam_ros.frames import parse_pose
-from splatam_ros.transforms import KEEP_NS, TransformError, TransformTree
+from splatam_core.geometry import se3
+from splatam_ros.frames.buffer import KEEP_NS, TransformError, TransformTree
+from splatam_ros.frames.rep105 import parse_pose
 
 SECOND = 10**9
 EXACT = 1e-12  # a handful of float64 products of numbers around one

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core.camera import PinholeCamera
 from splatam_core.datasets.room import furniture
 from splatam_core.datasets.room.light import Light
 from splatam_core.datasets.room.surfaces import Array, Hits, Image, Region, Surface, View
+from splatam_core.geometry.camera import PinholeCamera
 
 ATLAS_WIDTH = 4096
 
@@ -66,9 +66,7 @@ class Room:
     def cast(self, camera: PinholeCamera, T_world_cam: Array) -> Cast:
         """Follow one ray through each pixel's centre."""
         shape = (camera.height, camera.width)
-        nearest = Cast(
-            np.full(shape, np.inf, np.float32), np.zeros(shape, np.int16), *np.zeros((2, *shape), np.float32)
-        )
+        nearest = Cast(np.full(shape, np.inf, np.float32), np.zeros(shape, np.int16), *np.zeros((2, *shape), np.float32))
         view = View(camera, T_world_cam)
         for index, region in view.regions_of(self._outlines).items():
             hits = self._surfaces[index].intersect(view, region)

@@ -61,9 +61,7 @@ def spheres() -> list[Sphere]:
 def _desk() -> list[Box]:
     x, y = DESK_CENTER
     legs = [
-        _box((x + side * 0.78, y + end * 0.34, 0.355), (0.07, 0.07, 0.71), textures.wood)
-        for side in (-1, 1)
-        for end in (-1, 1)
+        _box((x + side * 0.78, y + end * 0.34, 0.355), (0.07, 0.07, 0.71), textures.wood) for side in (-1, 1) for end in (-1, 1)
     ]
     return [_box((x, y, DESK_TOP - 0.02), (1.7, 0.8, 0.04), textures.wood), *legs]
 

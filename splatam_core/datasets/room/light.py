@@ -37,10 +37,7 @@ class Light:
         light += self._from(self._lamp, np.float32([0, 0, -1]), self.LAMP, points, normals)
         light += self._from(self._window, np.float32([1, 0, 0]), self.DAYLIGHT, points, normals)
         parts = np.split(light.astype(np.float32), counts)
-        return [
-            cv2.resize(part.reshape(u.shape), surface.size_texels)
-            for part, (u, _), surface in zip(parts, grids, surfaces)
-        ]
+        return [cv2.resize(part.reshape(u.shape), surface.size_texels) for part, (u, _), surface in zip(parts, grids, surfaces)]
 
     def _from(self, sources: list[Array], facing: Image, power: float, points: Image, normals: Image) -> Image:
         """Lambertian light from an area light, sampled at a few sources, on [3, N] points."""

@@ -12,8 +12,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core import se3
-from splatam_core.camera import PinholeCamera
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]

@@ -116,9 +116,7 @@ def fabric(rng: np.random.Generator, height: int, width: int, base: Color, accen
 
 def rug(rng: np.random.Generator, height: int, width: int) -> Paint:
     """A carpet: framed borders around a field of diamonds."""
-    palette = np.float32(
-        [(0.52, 0.1, 0.12), (0.82, 0.68, 0.42), (0.1, 0.16, 0.34), (0.25, 0.42, 0.36), (0.7, 0.35, 0.2)]
-    )
+    palette = np.float32([(0.52, 0.1, 0.12), (0.82, 0.68, 0.42), (0.1, 0.16, 0.34), (0.25, 0.42, 0.36), (0.7, 0.35, 0.2)])
     y, x = np.mgrid[:height, :width].astype(np.float32)
     edge = np.minimum(np.minimum(x, width - 1 - x), np.minimum(y, height - 1 - y))
     diamond = np.abs(x % 90 - 45) + np.abs(y % 90 - 45)
@@ -187,9 +185,7 @@ def window(rng: np.random.Generator, height: int, width: int) -> Paint:
     return np.clip(paint, 0, 1).astype(np.float32)
 
 
-def tiles(
-    rng: np.random.Generator, height: int, width: int, base: Color = (0.86, 0.86, 0.84), pitch: int = 120
-) -> Paint:
+def tiles(rng: np.random.Generator, height: int, width: int, base: Color = (0.86, 0.86, 0.84), pitch: int = 120) -> Paint:
     """Ceiling tiles: dark joints, speckles, each tile a little different."""
     y, x = np.mgrid[:height, :width]
     tones = rng.normal(0, 0.04, (height // pitch + 1, width // pitch + 1)).astype(np.float32)

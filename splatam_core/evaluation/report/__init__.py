@@ -1,0 +1,1 @@
+"""Shows scores: pages, plots and tables."""

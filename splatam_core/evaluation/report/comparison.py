@@ -1,0 +1,158 @@
+"""Several runs side by side: a table for Markdown and terminals, and a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, MaxNLocator
+
+from splatam_core.evaluation.report import picture, plots
+from splatam_core.evaluation.report.descriptions import BY_NAME, Description
+from splatam_core.runs.metrics import Metrics
+from splatam_core.runs.run_folder import RunRecord
+
+COLUMNS = (
+    'ate_rmse_m', 'rpe_trans_frame_m', 'rpe_trans_1s_m', 'psnr_db', 'ssim', 'ms_ssim', 'lpips', 'depth_l1_m',
+    'heldout_psnr_db', 'heldout_depth_l1_m', 'novel_psnr_db', 'novel_depth_l1_m', 'splatam_ate_mean_m',
+    'splatam_psnr_db', 'splatam_ms_ssim', 'splatam_depth_l1_m', 'fps', 'num_gaussians', 'peak_rss_mb',
+)  # fmt: skip
+"""Of the table, where any run has them."""
+
+PREFIXES = {'heldout_': 'held out: ', 'novel_': 'novel: ', 'splatam_': 'as original: '}
+BARS = ('ate_rmse_m', 'psnr_db', 'depth_l1_m', 'fps', 'num_gaussians', 'peak_rss_mb')
+COLORS = ('#1769e0', '#d6409f', '#30a46c', '#f5a524', '#8e4ec6', '#00a2c7', '#e5484d', '#6b7480')
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Run:
+    label: str
+    record: RunRecord
+    metrics: Metrics
+
+
+def comparison_table(runs: Sequence[RunRecord]) -> str:
+    """A Markdown table, one run a line, below what they have in common: source, commit, machine."""
+    named = _named(runs)
+    commits = {run.commit or 'unknown' for run in runs}
+    sources = {_source(run) for run in runs}
+    columns = [
+        ('run', [run.label for run in named]),
+        *([('source', [_source(run) for run in runs])] if len(sources) > 1 else []),
+        *([('commit', [(run.commit or 'unknown')[:10] for run in runs])] if len(commits) > 1 else []),
+        ('preset', [run.description.preset or 'none' for run in runs]),
+        ('tracked', [f'{run.metrics.tracked}/{run.metrics.frames}' for run in named]),
+    ]
+    for name in COLUMNS:
+        cells = [BY_NAME[name].text(run.metrics) for run in named]
+        if any(cell != '\u2013' for cell in cells):
+            columns.append((_heading(BY_NAME[name]), cells))
+    return '\n'.join([_in_common(runs, sources, commits), '', *_lines(columns)])
+
+
+def _in_common(runs: Sequence[RunRecord], sources: set[str], commits: set[str]) -> str:
+    machines = sorted({_machine(run) for run in runs})
+    parts = [
+        *(sources if len(sources) == 1 else []),
+        *(f'commit {c[:18]}' for c in commits if len(commits) == 1),
+        *machines,
+    ]
+    return '; '.join(parts)
+
+
+def _machine(run: RunRecord) -> str:
+    machine = run.machine
+    return f'{machine.get("processor", "unknown processor")}, {machine.get("cores", "?")} cores'
+
+
+def _source(run: RunRecord) -> str:
+    source = run.description.source
+    return 'live topics' if source is None else source.path
+
+
+def _named(runs: Sequence[RunRecord]) -> list[_Run]:
+    """Runs with labels that tell them apart: the folder's name, or its path where two have the same."""
+    names = [run.path.resolve().name for run in runs]
+    labels = [name if names.count(name) == 1 else str(run.path) for name, run in zip(names, runs)]
+    return [_Run(label, run, run.metrics()) for label, run in zip(labels, runs)]
+
+
+def _heading(description: Description) -> str:
+    prefix = next((words for name, words in PREFIXES.items() if description.name.startswith(name)), '')
+    label = prefix + description.label.removesuffix(' as the original')
+    return f'{label} {description.unit}'.rstrip()
+
+
+def _lines(columns: Sequence[tuple[str, list[str]]]) -> list[str]:
+    widths = [max(len(heading), *map(len, cells)) for heading, cells in columns]
+    rows = [[heading for heading, _ in columns], *zip(*(cells for _, cells in columns))]
+    lines = ['| ' + ' | '.join(cell.ljust(width) for cell, width in zip(row, widths)) + ' |' for row in rows]
+    return [lines[0], '|' + '|'.join('-' * (width + 2) for width in widths) + '|', *lines[1:]]
+
+
+def draw_comparison(runs: Sequence[RunRecord]) -> Figure:
+    """Bars of the headline numbers; below, paths from above, time per frame and map growth."""
+    named = _named(runs)
+    bars_in = 0.75 + 0.28 * len(named)
+    with matplotlib.rc_context(picture.STYLE):
+        figure = Figure(figsize=(15, bars_in + 4.6), facecolor='white', layout='constrained')
+        FigureCanvasAgg(figure)
+        above, below = figure.subfigures(2, 1, height_ratios=[bars_in, 4.6])
+        shown = [name for name in BARS if any(run.metrics.values()[name] is not None for run in named)]
+        for index, (ax, name) in enumerate(zip(np.atleast_1d(above.subplots(1, len(shown))), shown)):
+            _bars(ax, named, BY_NAME[name], with_labels=index == 0)
+        path, times, size = below.subplots(1, 3)
+        _paths(path, named)
+        _times(times, named)
+        _sizes(size, named)
+    return figure
+
+
+def _color(index: int) -> str:
+    return COLORS[index % len(COLORS)]
+
+
+def _bars(ax: Axes, runs: Sequence[_Run], description: Description, with_labels: bool) -> None:
+    values = [run.metrics.values()[description.name] for run in runs]
+    shown = [0.0 if value is None else value * description.factor for value in values]
+    bars = ax.barh(range(len(runs)), shown, color=[_color(index) for index in range(len(runs))], height=0.7)
+    ax.bar_label(bars, [description.text(run.metrics) for run in runs], padding=4, color=plots.INK, fontsize=9)
+    ax.set_yticks(range(len(runs)), [run.label for run in runs] if with_labels else [''] * len(runs))
+    ax.set(title=f'{description.label} {description.unit}'.rstrip(), xticks=[])
+    ax.set_xlim(0, 1.35 * max(*shown, 1e-9, 1e-9))
+    ax.invert_yaxis()
+    ax.grid(False)
+    ax.spines[['bottom', 'left']].set_visible(False)
+    ax.tick_params(left=False, labelcolor=plots.INK)
+
+
+def _paths(ax: Axes, runs: Sequence[_Run]) -> None:
+    for index, run in enumerate(runs):
+        centres = run.record.trajectory.T_world_cam[:, :3, 3]
+        ax.plot(centres[:, 0], centres[:, 2], color=_color(index), lw=1.5, label=run.label, alpha=0.85)
+    ax.set(title='Paths from above', xlabel='x, right (m)', ylabel='z, forward (m)')
+    ax.set_aspect('equal', adjustable='datalim')
+    ax.legend(loc='best')
+
+
+def _times(ax: Axes, runs: Sequence[_Run]) -> None:
+    for index, run in enumerate(runs):
+        ax.plot([frame.process_ms for frame in run.record.frames], color=_color(index), lw=1.0, alpha=0.85)
+    ax.set(title='Time per frame', xlabel='frame', ylabel='ms')
+    if any(run.record.frames for run in runs):
+        ax.set_yscale('log')
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def _sizes(ax: Axes, runs: Sequence[_Run]) -> None:
+    for index, run in enumerate(runs):
+        ax.plot([frame.num_gaussians for frame in run.record.frames], color=_color(index), lw=1.5)
+    ax.set(title='Gaussians', xlabel='frame')
+    ax.set_ylim(bottom=0)
+    ax.yaxis.set_major_formatter(EngFormatter(sep=''))
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))

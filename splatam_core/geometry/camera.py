@@ -1,0 +1,100 @@
+"""Pinhole cameras, their calibration, and turning recorded images into frames.
+
+A pixel's centre is its integer index, everywhere. Resizing by ``s`` therefore maps
+``f' = s f`` and ``c' = (c + 0.5) s - 0.5``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatam_core.errors import CameraError
+
+DISTORTION_COEFFICIENTS = {
+    'none': (0,),
+    'plumb_bob': (4, 5),
+    'rational_polynomial': (8,),
+    'equidistant': (4,),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class PinholeCamera:
+    """An ideal camera: size and focal lengths in pixels, principal point in pixel indices."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise CameraError(f'camera size {self.width}x{self.height}: both must be at least 1 pixel')
+        if not (np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() and self.fx > 0 and self.fy > 0):
+            raise CameraError(
+                f'camera intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}: focal lengths must be '
+                'positive and all four finite; is the camera calibrated?'
+            )
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The intrinsic matrix K, [3, 3]."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
+
+    def cropped(self, width: int, height: int, left: int = 0, top: int = 0) -> PinholeCamera:
+        """The camera of a part of the image."""
+        return PinholeCamera(width, height, self.fx, self.fy, self.cx - left, self.cy - top)
+
+    def resized(self, width: int, height: int) -> PinholeCamera:
+        """The camera of the same image resampled to another size."""
+        sx, sy = width / self.width, height / self.height
+        return PinholeCamera(width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
+
+
+class Intrinsics(Protocol):
+    """Whatever states a camera: a CameraInfo adapter's result, a ``camera.yaml``."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion_model: str
+    distortion: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCalibration:
+    """A real camera: a pinhole and how its lens departs from one (OpenCV's coefficient order)."""
+
+    pinhole: PinholeCamera
+    distortion_model: str = 'none'
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        allowed = DISTORTION_COEFFICIENTS.get(self.distortion_model)
+        if allowed is None:
+            raise CameraError(f"distortion model '{self.distortion_model}' is not one of {', '.join(DISTORTION_COEFFICIENTS)}")
+        if self.is_distorted and len(self.distortion) not in allowed:
+            raise CameraError(
+                f'{self.distortion_model} takes {" or ".join(map(str, allowed))} coefficients, got {len(self.distortion)}'
+            )
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether any coefficient bends a ray."""
+        return any(self.distortion)
+
+    @classmethod
+    def from_intrinsics(cls, intrinsics: Intrinsics) -> CameraCalibration:
+        """The calibration a camera states about itself."""
+        i = intrinsics
+        pinhole = PinholeCamera(i.width, i.height, i.fx, i.fy, i.cx, i.cy)
+        return cls(pinhole, i.distortion_model, tuple(i.distortion))

@@ -1,0 +1,1 @@
+"""Images as the stages see them: views, filters, rectification."""

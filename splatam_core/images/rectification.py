@@ -1,0 +1,146 @@
+"""Turn recorded images into frames of an ideal camera: rectify, register, resize."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatam_core.errors import CameraError, FrameError
+from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
+from splatam_core.types import RgbdFrame
+
+
+@dataclass(frozen=True)
+class FrameFactory:
+    """Makes frames of one ideal camera out of one real camera's images.
+
+    Rectifies (colour bilinear, depth nearest) and resizes (colour by area when shrinking, depth
+    nearest). Depth is measured along the optical axis, so rectification moves it but keeps its value.
+
+    Attributes:
+        calibration: the camera that took the images.
+        width: width of the frames in pixels; None keeps the recorded size. Height follows the aspect.
+        depth_camera: the ideal camera of the depth images where it is not colour's. It has the same centre
+            and axes, so that depth only moves to other pixels.
+        rectified: the ideal camera to rectify to, in the recorded size, where it is not the calibration's
+            own: frames whose cameras differ a little come out as frames of one.
+    """
+
+    calibration: CameraCalibration
+    width: int | None = None
+    depth_camera: PinholeCamera | None = None
+    rectified: PinholeCamera | None = None
+
+    def __post_init__(self) -> None:
+        if self.width is not None and self.width < 16:
+            raise CameraError(f'width {self.width}: frames must be at least 16 pixels wide')
+
+    @cached_property
+    def camera(self) -> PinholeCamera:
+        """The ideal camera of every frame made here."""
+        pinhole = self._pinhole
+        if self.width is None or self.width == pinhole.width:
+            return pinhole
+        return pinhole.resized(self.width, max(1, round(pinhole.height * self.width / pinhole.width)))
+
+    @property
+    def _pinhole(self) -> PinholeCamera:
+        return self.rectified or self.calibration.pinhole
+
+    @cached_property
+    def _maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Where in a recorded image each rectified pixel lies: x and y, [H, W] each."""
+        calibration, pinhole = self.calibration, self._pinhole
+        if not calibration.is_distorted and pinhole == calibration.pinhole:
+            return None
+        undistort = (
+            cv2.fisheye.initUndistortRectifyMap if calibration.distortion_model == 'equidistant' else cv2.initUndistortRectifyMap
+        )
+        distortion = np.array(calibration.distortion if calibration.is_distorted else [0.0] * 4)
+        return undistort(
+            calibration.pinhole.matrix, distortion, np.eye(3), pinhole.matrix,
+            (pinhole.width, pinhole.height), cv2.CV_32FC1,
+        )  # fmt: skip
+
+    @cached_property
+    def _depth_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """The same for depth images."""
+        if self.depth_camera is None:
+            return self._maps
+        to, of = self._pinhole, self.depth_camera
+        x = (np.arange(to.width) - to.cx) / to.fx * of.fx + of.cx
+        y = (np.arange(to.height) - to.cy) / to.fy * of.fy + of.cy
+        x, y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
+        return x, y
+
+    def make(self, stamp_ns: int, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> RgbdFrame:
+        """Make one frame.
+
+        Args:
+            stamp_ns: time of the exposure.
+            rgb: [H, W, 3] in the recorded size.
+            depth_m: metres, registered to colour; another resolution of the same view will do. 0, NaN and inf are no
+                reading. [H, W], or the size of ``depth_camera`` where there is one.
+
+        Raises:
+            FrameError: colour has another size than the calibration, or depth another shape.
+        """
+        pinhole = self.calibration.pinhole
+        if rgb.shape[:2] != (pinhole.height, pinhole.width):
+            raise FrameError(
+                f'colour image is {_size(rgb)} but the camera is calibrated for {pinhole.width}x{pinhole.height}; '
+                'is the camera info that of this image?'
+            )
+        if self.depth_camera is None:
+            depth_m = self._at_colour_size(depth_m)
+        else:
+            _check_depth_size(depth_m, self.depth_camera)
+        if self._maps is not None:
+            rgb = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR)
+        if self._depth_maps is not None:
+            depth_m = cv2.remap(depth_m, *self._depth_maps, cv2.INTER_NEAREST)
+        size = (self.camera.width, self.camera.height)
+        if size != (self._pinhole.width, self._pinhole.height):
+            shrinking = size[0] < self._pinhole.width
+            rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)
+            depth_m = _resize_nearest(depth_m, size)
+        depth_m = kept(depth_m, (depth_m > 0) & (depth_m < np.inf))
+        return RgbdFrame(stamp_ns, np.ascontiguousarray(rgb), depth_m, self.camera)
+
+    def _at_colour_size(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        width, height = self.calibration.pinhole.width, self.calibration.pinhole.height
+        if depth_m.shape == (height, width):
+            return depth_m
+        if abs(depth_m.shape[0] - height * depth_m.shape[1] / width) >= 1:  # a row: halving an odd size rounds
+            raise FrameError(
+                f'depth image is {_size(depth_m)}, which is no other resolution of a {width}x{height} colour image, so '
+                'it is not registered to it; use the depth that the driver aligns to colour, with RealSense '
+                'aligned_depth_to_color, with Azure Kinect depth_to_rgb'
+            )
+        return _resize_nearest(depth_m, (width, height))
+
+
+def _size(image: NDArray[Any]) -> str:
+    return f'{image.shape[1]}x{image.shape[0]}'
+
+
+def _check_depth_size(depth_m: NDArray[np.float32], camera: PinholeCamera) -> None:
+    if depth_m.shape != (camera.height, camera.width):
+        raise FrameError(f'depth image is {_size(depth_m)} but its camera is calibrated for {camera.width}x{camera.height}')
+
+
+def kept(depth_m: NDArray[np.floating[Any]], chosen: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """[H, W] the readings that are chosen, 0 elsewhere; three times as fast as ``np.where``."""
+    readings = np.zeros(depth_m.shape, np.float32)
+    np.copyto(readings, depth_m, where=chosen, casting='same_kind')
+    return readings
+
+
+def _resize_nearest(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """Nearest by pixel centres; cv2.INTER_NEAREST rounds the corner instead and shifts by half a pixel."""
+    return cv2.resize(image, size, interpolation=cv2.INTER_NEAREST_EXACT)

@@ -1,0 +1,1 @@
+"""The map and everything that changes it."""

@@ -1,0 +1,73 @@
+"""Where a frame shows what the map lacks, and the Gaussians that fill it (paper, section 3.3)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from splatam_core.config import DensificationConfig
+from splatam_core.images.filters import box_sums, median
+from splatam_core.images.view import View, unproject
+from splatam_core.mapping.gaussian_map import GaussianMap
+from splatam_core.rasterizer import Gaussians, Rasterizer, Render
+
+MAX_BIAS = 0.1  # share of the depth; pixels that are farther off see another surface
+BIAS_WINDOW = 5  # pixels
+
+
+def densify(
+    gaussian_map: GaussianMap, view: View, T_cam_world: Tensor, rasterizer: Rasterizer, config: DensificationConfig
+) -> None:
+    """Add the Gaussians that make the map explain the view."""
+    view = view.narrowed(config.scale, config.max_width)
+
+    def render() -> Render:
+        return rasterizer.render(gaussian_map.gaussians.detached(), view.camera, T_cam_world)
+
+    with torch.no_grad():
+        chosen, depth = unexplained(render(), view, config), view.depth
+        gaussian_map.append(new_gaussians(view, chosen, depth, T_cam_world, config.opacity))
+        for _ in range(config.settle):
+            depth = depth - depth_bias(render(), view)
+            gaussian_map.replace_last(new_gaussians(view, chosen, depth, T_cam_world, config.opacity))
+
+
+def depth_bias(render: Render, view: View) -> Tensor:
+    """[H, W] metres by which the rendered depth is off, averaged over each pixel's surroundings.
+
+    Blending front to back favours the nearer neighbours, so on slanted or noisy surfaces a fresh map renders too near.
+    Only the average is of interest: a pixel's own error is mostly noise, and following it would add to it.
+    """
+    depth = render.depth()
+    compared = (view.valid & (depth > 0) & ((depth - view.depth).abs() < MAX_BIAS * view.depth)).float()
+    error, weight = (box_sums(image, BIAS_WINDOW) for image in (compared * (depth - view.depth), compared))
+    return error / weight.clamp(min=1)
+
+
+def unexplained(render: Render, view: View, config: DensificationConfig) -> Tensor:
+    """[H, W] pixels that see no map, or something new in front of it (paper, eq. 9).
+
+    The median error is taken over the pixels that have both a reading and map behind it.
+    """
+    unmapped = render.silhouette < config.silhouette_threshold
+    depth = render.depth()
+    error = (depth - view.depth).abs()
+    compared = view.valid & (depth > 0)
+    in_front = (depth > view.depth) & (error > config.depth_error_ratio * median(error, compared))
+    return (unmapped | in_front) & view.valid
+
+
+def new_gaussians(view: View, chosen: Tensor, depth: Tensor, T_cam_world: Tensor, opacity: float) -> Gaussians:
+    """One Gaussian per chosen pixel [H, W] at a depth [H, W], one pixel wide, of the pixel's colour."""
+    v, u = torch.nonzero(chosen, as_tuple=True)
+    points = unproject(view.camera, u, v, depth[v, u])  # [K, 3]
+    R, t = T_cam_world[:3, :3], T_cam_world[:3, 3]
+    focal = (view.camera.fx + view.camera.fy) / 2
+    return Gaussians(
+        means=(points - t) @ R,
+        log_scales=torch.log(points[:, 2:] / focal),
+        logit_opacities=points.new_full((len(points),), math.log(opacity / (1 - opacity))),
+        rgb=view.rgb[:, v, u].T.contiguous(),
+    )

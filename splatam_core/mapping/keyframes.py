@@ -1,0 +1,246 @@
+"""Which views are kept, and which are mapped together: some keyframes, the last keyframe, the current view."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from splatam_core.config import KeyframeConfig
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.images.view import View, unproject
+
+_TOGETHER = 64  # keyframes whose overlap is found at once: more would not stay in a core's cache
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedView:
+    """A view and where it was taken from.
+
+    Attributes:
+        view: the images.
+        T_cam_world: [4, 4] float32.
+    """
+
+    view: View
+    T_cam_world: Tensor
+
+    def to(self, device: torch.device) -> PosedView:
+        """The same on a device; itself where it is there already."""
+        if self.view.depth.device == device:
+            return self
+        return PosedView(self.view.to(device), self.T_cam_world.to(device, non_blocking=True))
+
+    def bare(self) -> PosedView:
+        """The same without what its view has worked out: seven bytes a pixel."""
+        return PosedView(replace(self.view), self.T_cam_world)
+
+
+class KeyframeStore(Sequence[PosedView]):
+    """Keyframes, in the host's memory; copies of those used last are on the device.
+
+    Attributes:
+        config: how many there may be, and how many of them on the device.
+    """
+
+    def __init__(self, device: torch.device, config: KeyframeConfig) -> None:
+        self.config = config
+        self._device = device
+        self._kept: list[PosedView] = []
+        self._copies: dict[PosedView, PosedView] = {}  # the last used is the last
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __getitem__(self, index: Any) -> Any:
+        """As they are kept."""
+        return self._kept[index]
+
+    def append(self, keyframe: PosedView, copy: PosedView | None = None) -> None:
+        """Keep one more, in place of the least needed where there are as many as may be.
+
+        Args:
+            keyframe: in the host's memory.
+            copy: the same on the device, if it is there.
+        """
+        self._kept.append(keyframe)
+        while 0 < self.config.budget < len(self._kept):
+            self._copies.pop(self._kept.pop(least_needed(self._kept)), None)
+        if copy is not None and copy.view.depth.device != keyframe.view.depth.device:
+            self._remember(keyframe, copy)
+
+    def on_device(self, keyframe: PosedView) -> PosedView:
+        """A view on the device; brought there unless it is."""
+        if keyframe.view.depth.device == self._device:
+            return keyframe.bare()
+        copy = self._copies.pop(keyframe, None) or keyframe.to(self._device)
+        self._remember(keyframe, copy)
+        return copy
+
+    def window(self, views: Sequence[PosedView]) -> Window:
+        """Views, each brought to the device when it is taken."""
+        return Window(views, self)
+
+    def _remember(self, keyframe: PosedView, copy: PosedView) -> None:
+        self._copies[keyframe] = copy
+        while len(self._copies) > self.config.on_device:
+            del self._copies[next(iter(self._copies))]
+
+
+def least_needed(keyframes: Sequence[PosedView]) -> int:
+    """Which to let go: the one whose neighbours in time are nearest to each other, not the first or last of three or more.
+
+    Near: few metres and radians apart; what is a metre away moves as far in the image by the one as by the other.
+    """
+    if len(keyframes) < 3:
+        return 0
+    T = torch.stack([keyframe.T_cam_world for keyframe in keyframes])
+    R, t = T[:, :3, :3], T[:, :3, 3:]
+    centres = -(R.mT @ t).squeeze(2)
+    between = torch.linalg.norm(centres[2:] - centres[:-2], dim=1)
+    turned = torch.linalg.matrix_norm(R[2:] - R[:-2]) / math.sqrt(2)  # 2 sin(angle / 2)
+    return 1 + int(torch.argmin(between + turned))
+
+
+class Window(Sequence[PosedView]):
+    """Views to map; only those that are taken from it need be on the device."""
+
+    def __init__(self, views: Sequence[PosedView], store: KeyframeStore) -> None:
+        self._views, self._store = views, store
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __getitem__(self, index: Any) -> Any:
+        """One view, on the device."""
+        return self._store.on_device(self._views[index])
+
+
+def select_keyframes(
+    current: PosedView, keyframes: Sequence[PosedView], config: KeyframeConfig, rng: np.random.Generator
+) -> list[PosedView]:
+    """Those to map with the current view: some by the configured selection, and the last. All in the host's memory.
+
+    By default random ones that overlap, not the best: those are nearly the current view, and the map would forget the rest.
+    """
+    if not keyframes or config.window == 1:
+        return []
+    *earlier, last = keyframes
+    count = max(0, config.window - 2)
+    chosen = _SELECTIONS[config.selection](current, earlier, count, config, rng)
+    return [*(earlier[i] for i in chosen), last]
+
+
+def _overlapping(
+    current: PosedView, keyframes: Sequence[PosedView], count: int, config: KeyframeConfig, rng: np.random.Generator
+) -> list[int]:
+    overlapping = np.flatnonzero(_seen(current, keyframes, config, rng))
+    return list(overlapping[rng.permutation(len(overlapping))[:count]])
+
+
+def _most_overlapping(
+    current: PosedView, keyframes: Sequence[PosedView], count: int, config: KeyframeConfig, rng: np.random.Generator
+) -> list[int]:
+    seen = _seen(current, keyframes, config, rng)
+    best = np.argsort(-seen, kind='stable')[:count]
+    return list(best[seen[best] > 0])
+
+
+def _random(
+    current: PosedView, keyframes: Sequence[PosedView], count: int, config: KeyframeConfig, rng: np.random.Generator
+) -> list[int]:
+    return list(rng.permutation(len(keyframes))[:count])
+
+
+def _latest(
+    current: PosedView, keyframes: Sequence[PosedView], count: int, config: KeyframeConfig, rng: np.random.Generator
+) -> list[int]:
+    return list(range(max(0, len(keyframes) - count), len(keyframes)))
+
+
+def _uniform(
+    current: PosedView, keyframes: Sequence[PosedView], count: int, config: KeyframeConfig, rng: np.random.Generator
+) -> list[int]:
+    return list(np.unique(np.linspace(0, len(keyframes) - 1, min(count, len(keyframes))).round().astype(int)))
+
+
+_SELECTIONS = {
+    'overlap': _overlapping, 'most_overlap': _most_overlapping, 'random': _random, 'latest': _latest, 'uniform': _uniform,
+}  # fmt: skip
+
+
+def is_due(index: int, config: KeyframeConfig, num_frames: int | None) -> bool:
+    """Whether a frame is to be kept.
+
+    Args:
+        index: its number, from 0.
+        config: how often.
+        num_frames: of the recording, where that is known.
+    """
+    every = config.every
+    if num_frames is not None and config.at_least:
+        every = min(every, max(1, num_frames // config.at_least))
+    before_last = config.before_last and num_frames is not None and index == num_frames - 2
+    return index % every == 0 or before_last
+
+
+def _seen(
+    current: PosedView, keyframes: Sequence[PosedView], config: KeyframeConfig, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    points = sample_points(current, config.overlap_samples, rng)
+    return np.array(overlaps(points, current.view.camera, keyframes, config.overlap_margin))
+
+
+def sample_points(posed: PosedView, count: int, rng: np.random.Generator) -> Tensor:
+    """[count, 3] world points of random pixels with a reading, drawn with replacement; none where none has one."""
+    depth = posed.view.depth
+    with_reading = np.flatnonzero(posed.view.valid.numpy())  # eight times as fast as torch's
+    if len(with_reading) == 0:
+        return depth.new_empty(0, 3)
+    drawn = torch.from_numpy(with_reading[rng.integers(len(with_reading), size=count)])
+    v, u = drawn // depth.shape[1], drawn % depth.shape[1]
+    points = unproject(posed.view.camera, u, v, depth[v, u])
+    return (points - posed.T_cam_world[:3, 3]) @ posed.T_cam_world[:3, :3]
+
+
+def overlaps(points: Tensor, camera: PinholeCamera, keyframes: Sequence[PosedView], margin: int) -> list[float]:
+    """Share of world points [K, 3] that the camera, where each view was taken, has more than ``margin`` pixels inside."""
+    if not len(points) or not keyframes:
+        return [0.0] * len(keyframes)
+    T = torch.stack([keyframe.T_cam_world for keyframe in keyframes])[:, :3]  # [N, 3, 4]
+    shares = torch.zeros(len(T))
+    near = _may_see(points, camera, T).nonzero()[:, 0]  # of a long way, few
+    homogeneous = torch.cat([points.T, points.new_ones(1, len(points))])  # [4, K]
+    for chosen in near.split(_TOGETHER):
+        x, y, z = (T[chosen].reshape(-1, 4) @ homogeneous).view(len(chosen), 3, -1).unbind(1)  # [N, K] each, by one product
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        inside = (u > margin) & (u < camera.width - margin) & (v > margin) & (v < camera.height - margin) & (z > 0)
+        shares[chosen] = inside.float().mean(dim=1)
+    return shares.tolist()
+
+
+def _may_see(points: Tensor, camera: PinholeCamera, T_cam_world: Tensor) -> Tensor:
+    """[N] false where a sphere about the points is behind the camera at [N, 3, 4], or beyond an edge of its image."""
+    centre = points.mean(dim=0)
+    radius = 1.001 * float((points - centre).norm(dim=1).max()) + 1e-3  # what rounding might do is seen
+    x, y, z = (T_cam_world[:, :, :3] @ centre + T_cam_world[:, :, 3]).unbind(1)
+    seen = z > -radius
+    for across, focal, pixels in (
+        (x, camera.fx, camera.cx), (-x, camera.fx, camera.width - camera.cx),
+        (y, camera.fy, camera.cy), (-y, camera.fy, camera.height - camera.cy),
+    ):  # fmt: skip
+        seen &= focal * across + pixels * z > -radius * math.hypot(focal, pixels)
+    return seen
+
+
+def draw(window: Sequence[PosedView], config: KeyframeConfig, rng: np.random.Generator) -> PosedView:
+    """One view of a window, whose last is the current one."""
+    if config.current_share == 0 or len(window) == 1:
+        return window[rng.integers(len(window))]
+    return window[-1] if rng.random() < config.current_share else window[rng.integers(len(window) - 1)]

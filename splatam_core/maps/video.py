@@ -1,0 +1,118 @@
+"""A map filmed along a path: pictures and videos of colour, depth and silhouette."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatam_core.device import pose_tensor
+from splatam_core.errors import RasterizerError
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.geometry.trajectory import Trajectory
+from splatam_core.rasterizer import Gaussians, Rasterizer
+from splatam_core.types import RenderedView
+
+KINDS = ('color', 'depth', 'silhouette')
+DEPTH_COUNTS_PER_M = 1000
+MAX_COUNT = 65535
+CODEC = 'mp4v'
+MIN_RATE_HZ, MAX_RATE_HZ = 1.0, 120.0
+
+Picture = NDArray[np.uint8]
+
+
+def render_along(
+    gaussians: Gaussians,
+    rasterizer: Rasterizer,
+    camera: PinholeCamera,
+    path: Trajectory,
+    folder: Path,
+    *,
+    images: bool,
+    rate_hz: float | None,
+    progress: Callable[[range], Iterable[int]],
+) -> None:
+    """Write what a map looks like from each pose of a path.
+
+    ::
+
+        color/000000.png       8 bit RGB
+        depth/000000.png       16 bit millimetres, expected depth; 0 = none
+        silhouette/000000.png  8 bit, 255 = all map
+        color.mp4 depth.mp4 silhouette.mp4  depth from near (yellow) to far (blue), black = none
+
+    Args:
+        gaussians: the map, on the rasterizer's device.
+        rasterizer: draws it.
+        camera: what it is seen through.
+        path: from where, in the map's world.
+        folder: exists and is empty.
+        images: whether to write the pictures.
+        rate_hz: of the videos; None = no videos.
+        progress: wraps the loop over the poses.
+
+    Raises:
+        RasterizerError: this OpenCV cannot write such videos.
+    """
+    map_only = gaussians.detached()
+    far_m: float | None = None  # of the first pose that sees anything: a scale that jumps would flicker
+    with ExitStack() as stack:
+        films = {} if rate_hz is None else {kind: _film(stack, folder, kind, camera, rate_hz) for kind in KINDS}
+        for kind in KINDS if images else ():
+            (folder / kind).mkdir()
+        for index in progress(range(len(path))):
+            T_cam_world = pose_tensor(se3.inverse(path.T_world_cam[index]), map_only.means.device)
+            with torch.no_grad():
+                view = rasterizer.render(map_only, camera, T_cam_world).images()
+            far_m = far_m or float(view.depth_m.max()) or None
+            if images:
+                _write_images(folder, index, view)
+            for kind, film in films.items():
+                film.write(_film_picture(kind, view, far_m or 1.0))
+
+
+def median_rate_hz(path: Trajectory) -> float:
+    """How fast the poses of a path follow each other, within what videos can do."""
+    if len(path) < 2:
+        return MIN_RATE_HZ
+    return float(np.clip(1e9 / np.median(np.diff(path.stamps_ns)), MIN_RATE_HZ, MAX_RATE_HZ))
+
+
+def _film(stack: ExitStack, folder: Path, kind: str, camera: PinholeCamera, rate_hz: float) -> cv2.VideoWriter:
+    path = folder / f'{kind}.mp4'
+    film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*CODEC), rate_hz, (camera.width, camera.height))
+    stack.callback(film.release)
+    if not film.isOpened():
+        raise RasterizerError(f'{path}: this OpenCV writes no {CODEC} videos; leave them out with --no-video')
+    return film
+
+
+def _film_picture(kind: str, view: RenderedView, far_m: float) -> Picture:
+    """[H, W, 3] as OpenCV's writer takes it, BGR."""
+    if kind == 'color':
+        return np.ascontiguousarray(view.rgb[..., ::-1])
+    if kind == 'silhouette':
+        return cv2.cvtColor(_silhouette(view), cv2.COLOR_GRAY2BGR)
+    nearness = 1 - np.clip(view.depth_m / far_m, 0, 1)
+    colored = cv2.applyColorMap(np.uint8(np.rint(255 * nearness)), cv2.COLORMAP_VIRIDIS)
+    colored[view.depth_m == 0] = 0
+    return colored
+
+
+def _write_images(folder: Path, index: int, view: RenderedView) -> None:
+    depth = np.rint(np.clip(view.depth_m * DEPTH_COUNTS_PER_M, 0, MAX_COUNT)).astype(np.uint16)
+    for kind, picture in zip(KINDS, (view.rgb[..., ::-1], depth, _silhouette(view))):
+        path = folder / kind / f'{index:06d}.png'
+        if not cv2.imwrite(str(path), picture):
+            raise RasterizerError(f'{path}: cannot be written')
+
+
+def _silhouette(view: RenderedView) -> Picture:
+    return np.uint8(np.rint(255 * np.clip(view.silhouette, 0, 1)))

@@ -1,0 +1,223 @@
+"""Checkpoints: all that the frames to come depend on, so that a run that was broken off goes on as if it had not been.
+
+::
+
+    checkpoints/
+        000040.checkpoint     after 40 frames: map, optimiser, motion, random numbers, and which keyframes
+        000060.checkpoint     after 60
+        keyframes/
+            3f0c….keyframe    images and pose, named by their checksum: written once, shared by all checkpoints
+
+A checkpoint is written after its keyframes and in one step: whatever interrupts that, the one before is whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+
+from splatam_core.atomic_io import is_unfinished
+from splatam_core.config import SlamConfig, flat_values, with_values
+from splatam_core.errors import CheckpointError, SplatamError
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.images.view import View
+from splatam_core.mapping.keyframes import PosedView
+from splatam_core.runs.archive import Content, seal, unseal
+from splatam_core.state import SlamState
+from splatam_core.tracking.motion import MotionState
+
+VERSION = 1
+KIND, KEYFRAME = 'checkpoint', 'keyframe'
+KEYFRAMES = 'keyframes'
+_MAP = 'map.'
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a recording has been processed.
+
+    Attributes:
+        length: frames of the recording.
+        last_index: index of the last frame processed.
+        last_digest: of that frame, see ``resuming.frame_digest``.
+        num_lines: frames written down in the run's folder.
+    """
+
+    length: int
+    last_index: int
+    last_digest: str
+    num_lines: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Checkpoint:
+    """A checkpoint that was read.
+
+    Attributes:
+        path: the file.
+        state: of Slam.
+        progress: in the recording.
+    """
+
+    path: Path
+    state: SlamState
+    progress: Progress
+
+
+class Checkpoints:
+    """Writes the checkpoints of one run. Not for several at once."""
+
+    def __init__(self, folder: Path, keep: int) -> None:
+        """Write nothing yet.
+
+        Args:
+            folder: the run's ``checkpoints/``.
+            keep: how many to keep; older ones are removed.
+        """
+        self._folder = folder
+        self._keep = keep
+        self._written: dict[PosedView, str] = {}
+        self._needed: dict[Path, frozenset[str]] = {}
+
+    def save(self, state: SlamState, progress: Progress) -> Path:
+        """Write a checkpoint, then remove what is too old. Returns the new file's path.
+
+        Raises:
+            OSError: it cannot be written; the checkpoints that are there stay.
+        """
+        (self._folder / KEYFRAMES).mkdir(parents=True, exist_ok=True)
+        self._written = {keyframe: self._write_keyframe(keyframe) for keyframe in state.keyframes}
+        digests = tuple(self._written.values())
+        path = self._folder / f'{progress.num_lines:06d}.{KIND}'
+        seal(KIND, VERSION, _pack(state, progress, digests)).write(path)
+        self._needed[path] = frozenset(digests)
+        self._remove_old()
+        return path
+
+    def _write_keyframe(self, keyframe: PosedView) -> str:
+        if keyframe in self._written:
+            return self._written[keyframe]
+        arrays = {
+            'rgb8': keyframe.view.rgb8.numpy(force=True), 'depth': keyframe.view.depth.numpy(force=True),
+            'T_cam_world': keyframe.T_cam_world.numpy(force=True),
+        }  # fmt: skip
+        file = seal(KEYFRAME, VERSION, Content({}, arrays))
+        file.write(_keyframe_path(self._folder, file.digest))
+        return file.digest
+
+    def _remove_old(self) -> None:
+        paths = checkpoint_paths(self._folder)
+        for path in paths[: -self._keep]:
+            path.unlink(missing_ok=True)
+        needed = {digest for path in paths[-self._keep :] for digest in self._digests_in(path)}
+        for path in (self._folder / KEYFRAMES).glob(f'*.{KEYFRAME}'):
+            if path.stem not in needed:
+                path.unlink(missing_ok=True)
+        for path in list(_unfinished(self._folder)):
+            path.unlink(missing_ok=True)
+
+    def _digests_in(self, path: Path) -> frozenset[str]:
+        """Keyframes of a checkpoint; a newer one need not have them all (``keyframes.budget``)."""
+        if path not in self._needed:  # written before the run was resumed
+            try:
+                self._needed[path] = frozenset(unseal(path, KIND, VERSION).values['keyframes'])
+            except (CheckpointError, KeyError, TypeError):
+                self._needed[path] = frozenset()  # it cannot be used anyway
+        return self._needed[path]
+
+
+def checkpoint_paths(folder: Path) -> list[Path]:
+    """The checkpoints in a run's ``checkpoints/``, the newest last."""
+    paths = (path for path in folder.glob(f'*.{KIND}') if path.stem.isdecimal())
+    return sorted(paths, key=lambda path: int(path.stem))
+
+
+def read_newest(folder: Path) -> Checkpoint:
+    """Read the newest checkpoint in a run's ``checkpoints/``.
+
+    Raises:
+        CheckpointError: there is none, or it cannot be used.
+    """
+    paths = checkpoint_paths(folder)
+    if not paths:
+        raise CheckpointError(f"{folder} holds no checkpoint: run with '--checkpoint-every N' to have some")
+    try:
+        return read_checkpoint(paths[-1])
+    except CheckpointError as error:
+        way_out = f'to go on from {paths[-2].name}' if len(paths) > 1 else 'and start anew: it is the only one'
+        raise CheckpointError(f'{error}; move {paths[-1].name} away {way_out}') from None
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint and its keyframes.
+
+    Raises:
+        CheckpointError: one of the files is missing, damaged, of another version or no checkpoint.
+    """
+    content = unseal(path, KIND, VERSION)
+    try:
+        return _unpack(path, content)
+    except CheckpointError:
+        raise
+    except (KeyError, TypeError, ValueError, SplatamError) as error:
+        raise CheckpointError(f'{path}: is no checkpoint that this version understands: {error!r}') from None
+
+
+def _pack(state: SlamState, progress: Progress, digests: Sequence[str]) -> Content:
+    motion = state.motion
+    values = {
+        'config': flat_values(state.config), 'camera': None if state.camera is None else asdict(state.camera),
+        'keyframes': list(digests), 'rng': state.rng, 'scene_radius': state.scene_radius, 'num_frames': state.num_frames,
+        'last_stamp_ns': state.last_stamp_ns, 'progress': asdict(progress),
+        'motion_ns': [motion.stamp_ns, motion.interval_ns],
+    }  # fmt: skip
+    arrays = {_MAP + name: array for name, array in state.map.items()}
+    return Content(values, arrays | {'T_world_cam': motion.T_world_cam, 'velocity': motion.velocity})
+
+
+def _unpack(path: Path, content: Content) -> Checkpoint:
+    values, arrays = content.values, content.arrays
+    camera = None if values['camera'] is None else PinholeCamera(**values['camera'])
+    stamp_ns, interval_ns = values['motion_ns']
+    state = SlamState(
+        config=with_values(SlamConfig(), values['config']),
+        camera=camera,
+        map={name.removeprefix(_MAP): array for name, array in arrays.items() if name.startswith(_MAP)},
+        keyframes=tuple(_read_keyframe(path.parent, digest, camera) for digest in values['keyframes']),
+        motion=MotionState(stamp_ns, interval_ns, arrays['T_world_cam'], arrays['velocity']),
+        rng=values['rng'],
+        scene_radius=values['scene_radius'],
+        num_frames=values['num_frames'],
+        last_stamp_ns=values['last_stamp_ns'],
+    )
+    return Checkpoint(path, state, Progress(**values['progress']))
+
+
+def _read_keyframe(folder: Path, digest: str, camera: PinholeCamera | None) -> PosedView:
+    path = _keyframe_path(folder, digest)
+    if camera is None:
+        raise CheckpointError(f'{path}: is no keyframe of this run, which has no camera')
+    arrays = unseal(path, KEYFRAME, VERSION, digest).arrays
+    rgb8, depth, T_cam_world = (arrays[name] for name in ('rgb8', 'depth', 'T_cam_world'))
+    if depth.ndim == 2 and depth.shape != (camera.height, camera.width):  # kept at another size (mapping.scale)
+        camera = camera.resized(*depth.shape[::-1])
+    size = (camera.height, camera.width)
+    expected = [('uint8', (*size, 3)), ('float32', size), ('float32', (4, 4))]
+    found = [(array.dtype.name, array.shape) for array in (rgb8, depth, T_cam_world)]
+    if found != expected:
+        raise CheckpointError(f'{path}: is no keyframe of this run: it holds {found}, expected {expected}')
+    return PosedView(View(camera, torch.from_numpy(rgb8), torch.from_numpy(depth)), torch.from_numpy(T_cam_world))
+
+
+def _keyframe_path(folder: Path, digest: str) -> Path:
+    return folder / KEYFRAMES / f'{digest}.{KEYFRAME}'
+
+
+def _unfinished(folder: Path) -> Iterator[Path]:
+    """What was left by a process that was killed while it wrote."""
+    for path in (*folder.glob(f'.*.{KIND}.*'), *folder.glob(f'{KEYFRAMES}/.*.{KEYFRAME}.*')):
+        if is_unfinished(path.name, (path.name.removeprefix('.').rpartition('.')[0],)):
+            yield path

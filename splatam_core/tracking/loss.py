@@ -1,0 +1,48 @@
+"""The paper's tracking loss (section 3.2, equation 8)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from splatam_core.config import TrackingConfig
+from splatam_core.images.filters import inliers
+from splatam_core.images.view import View
+from splatam_core.rasterizer import Render
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackingLoss:
+    """How far a pose is from explaining a view.
+
+    Attributes:
+        total: sum over the pixels that count, differentiable.
+        depth: the part of depth, unweighted, metres times pixels.
+        num_pixels: how many count, a scalar on the device.
+    """
+
+    total: Tensor
+    depth: Tensor
+    num_pixels: Tensor
+
+
+def tracking_loss(render: Render, view: View, config: TrackingConfig) -> TrackingLoss:
+    """Summed L1 of depth and colour where the map is sure and the sensor has a reading (paper, eq. 8).
+
+    Without the silhouette's mask depth counts at every reading, and colour at every pixel, map or not.
+    """
+    counts = view.valid & (render.silhouette.detach() > config.silhouette_threshold) if config.use_silhouette else view.valid
+    error = ((render.depth_acc if config.blended_depth else expected_depth(render)) - view.depth).abs()
+    if config.depth_outlier_ratio > 0:
+        counts = inliers(error.detach(), counts, config.depth_outlier_ratio)
+    mask = counts.to(view.rgb.dtype)
+    depth = (error * mask).sum()
+    difference = (render.rgb - view.rgb).abs()
+    color = (difference * mask).sum() if config.use_silhouette or config.depth_outlier_ratio > 0 else difference.sum()
+    return TrackingLoss(config.depth_weight * depth + config.color_weight * color, depth.detach(), counts.sum())
+
+
+def expected_depth(render: Render) -> Tensor:
+    """[H, W] metres; where little or no map is seen it fades to 0, differentiably."""
+    return render.depth_acc / render.silhouette.clamp(min=0.5)

@@ -1,0 +1,1 @@
+"""Coordinate frames: REP-105 arithmetic, TF and odometry."""

@@ -1,0 +1,146 @@
+"""Messages in, frames out: pairs, decodes and rectifies what the camera sends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, TypeVar
+
+from msg_adapters import camera_info, images, stamps
+from msg_adapters.camera_info import CameraParameters
+from msg_adapters.errors import MessageError
+from msg_adapters.synchronizer import RgbdSet, RgbdSynchronizer, SyncStatistics
+from splatam_core.errors import CameraError, FrameError
+from splatam_core.geometry.camera import CameraCalibration
+from splatam_core.images.rectification import FrameFactory
+from splatam_core.types import RgbdFrame
+from splatam_ros.node.gate import Gate
+from splatam_ros.node.parameters import NodeOptions
+from splatam_ros.throttled_warnings import ThrottledWarnings
+
+T = TypeVar('T')
+FAR_APART_NS = 20_000_000  # as rtabmap_ros warns from
+
+
+class Intake:
+    """Turns the three streams into frames. What cannot be used is left out with a warning; nothing raises.
+
+    Attributes:
+        camera_frame: frame id of the camera of the newest frame.
+    """
+
+    def __init__(self, options: NodeOptions, warnings: ThrottledWarnings, gate: Gate, on_skipped: Callable[[int], None]) -> None:
+        """Prepare.
+
+        Args:
+            options: the node's.
+            warnings: where to say what is left out.
+            gate: asked for each frame before it is decoded.
+            on_skipped: called with the stamp (ns) of each frame that the gate does not let through.
+        """
+        self.camera_frame = ''
+        self._synchronizer = RgbdSynchronizer(
+            options.sync_mode, round(options.sync_max_interval * 1e9), options.sync_queue_size,
+            round(options.time_jump_threshold * 1e9),
+        )  # fmt: skip
+        self._width = options.width or None
+        self._is_rectified = not options.undistort
+        self._decode_depth = partial(images.decode_depth, metres_per_count=options.depth_scale)
+        self._warnings = warnings
+        self._gate = gate
+        self._on_skipped = on_skipped
+        self._factory: FrameFactory | None = None
+        self._reported = self._synchronizer.statistics
+
+    @property
+    def statistics(self) -> SyncStatistics:
+        """Where the messages went."""
+        return self._synchronizer.statistics
+
+    def color(self, message: Any) -> list[RgbdFrame]:
+        """Take a colour image; the frames it completes."""
+        return self._frames(self._synchronizer.add_color(stamps.message_stamp_ns(message), message))
+
+    def depth(self, message: Any) -> list[RgbdFrame]:
+        """Take a depth image; the frames it completes."""
+        return self._frames(self._synchronizer.add_depth(stamps.message_stamp_ns(message), message))
+
+    def info(self, message: Any) -> list[RgbdFrame]:
+        """Take a CameraInfo; the frames that waited for the first. One that makes no sense changes nothing."""
+        read = partial(camera_info.parameters, is_rectified=self._is_rectified)
+        parameters = self._attempt('CameraInfo', read, message)
+        if parameters is None:
+            return []
+        return self._frames(self._synchronizer.add_info(stamps.message_stamp_ns(message), parameters))
+
+    def flush(self) -> list[RgbdFrame]:
+        """The frames that can be made if nothing more comes; what has no partner is dropped."""
+        return self._frames(self._synchronizer.flush())
+
+    def report_drops(self) -> None:
+        """Warn of what the synchronizer has dropped since the last report."""
+        before, now = self._reported, self._synchronizer.statistics
+        self._reported = now
+        self._report('duplicates', now.duplicates - before.duplicates, 'with a stamp that was there already')
+        self._report('late', now.late - before.late, 'older than the last frame; do the stamps increase?')
+        self._report('color', now.unpaired_color - before.unpaired_color, f'(colour) without depth{_gap(now)}')
+        self._report('depth', now.unpaired_depth - before.unpaired_depth, f'(depth) without colour{_gap(now)}')
+        self._report('without info', now.without_info - before.without_info, 'with depth, but no CameraInfo has come')
+
+    def _report(self, kind: str, count: int, what: str) -> None:
+        if count > 0:
+            self._warnings.warn(f'dropped {kind}', f'{count} image{"s" if count > 1 else ""} dropped: {what}')
+
+    def _frames(self, sets: list[RgbdSet]) -> list[RgbdFrame]:
+        frames = [self._frame(found) for found in sets if self._is_admitted(found)]
+        return [frame for frame in frames if frame is not None]
+
+    def _is_admitted(self, found: RgbdSet) -> bool:
+        is_admitted = self._gate.admits(found.resets, found.stamp_ns)
+        if not is_admitted:
+            self._on_skipped(found.stamp_ns)
+        return is_admitted
+
+    def _frame(self, found: RgbdSet) -> RgbdFrame | None:
+        factory = self._attempt('camera', self._frame_factory, found.info)
+        rgb = self._attempt('colour', images.decode_color, found.color)
+        depth_m = self._attempt('depth', self._decode_depth, found.depth)
+        if factory is None or rgb is None or depth_m is None:
+            return None
+        self.camera_frame = found.info.frame_id or found.color.header.frame_id
+        self._warn_of_what_may_not_fit(found)
+        frame = self._attempt('frame', lambda stamp_ns: factory.make(stamp_ns, rgb, depth_m), found.stamp_ns)
+        return None if frame is None else replace(frame, epoch=found.resets)
+
+    def _warn_of_what_may_not_fit(self, found: RgbdSet) -> None:
+        if abs(found.gap_ns) > FAR_APART_NS:
+            self._warnings.warn(
+                'gap', f'depth is {found.gap_ns / 1e9:+.3f} s from its colour: a moving camera will smear the map; '
+                'synchronize the two in the driver, or lower sync.max_interval',
+            )  # fmt: skip
+        color, depth = found.color.header.frame_id, found.depth.header.frame_id
+        if color != depth and color and depth:
+            self._warnings.warn(
+                'frame ids', f"depth is in frame '{depth}', colour in '{color}': depth must be registered to colour; "
+                'if it is not, use the depth that the driver aligns (RealSense: aligned_depth_to_color)',
+            )  # fmt: skip
+
+    def _frame_factory(self, parameters: CameraParameters) -> FrameFactory:
+        calibration = CameraCalibration.from_intrinsics(parameters)
+        if self._factory is None or self._factory.calibration != calibration:
+            self._factory = FrameFactory(calibration, self._width)
+        return self._factory
+
+    def _attempt(self, what: str, function: Callable[[Any], T], argument: Any) -> T | None:
+        try:
+            return function(argument)
+        except (MessageError, CameraError, FrameError) as error:
+            self._warnings.warn(what, f'{what} left out: {error}')
+            return None
+
+
+def _gap(statistics: SyncStatistics) -> str:
+    if statistics.newest_gap_ns is None:
+        return ''
+    return f'; the newest depth is {statistics.newest_gap_ns / 1e9:+.3f} s from the newest colour'

@@ -1,0 +1,97 @@
+"""``splatam_node``: the process around the node; signals, shutdown order, exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+import textwrap
+from collections.abc import Sequence
+
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.rcutils_logger import RcutilsLogger
+
+from splatam_core.config import Setting
+from splatam_core.errors import SplatamError
+from splatam_ros.node.node import SplatamNode
+from splatam_ros.node.parameters import NODE_SETTINGS
+from splatam_ros.process import StopRequest, ros, split_arguments
+
+PROGRAM = 'splatam_node'
+EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
+STEP_S = 0.1  # longest time until a signal is noticed
+HELP_COLUMNS, HELP_INDENT = 100, '      '
+
+
+class RosLog(logging.Handler):
+    """Hands the core's log records to the node's logger."""
+
+    def __init__(self, logger: RcutilsLogger) -> None:
+        super().__init__()
+        self._logger = logger
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Log a record at the ROS severity nearest to its own."""
+        if record.levelno >= logging.ERROR:
+            self._logger.error(record.getMessage())
+        elif record.levelno >= logging.WARNING:
+            self._logger.warning(record.getMessage())
+        else:
+            self._logger.info(record.getMessage())
+
+
+def run(for_ros: Sequence[str], stop: StopRequest) -> int:
+    """Run the node until it is finished or a signal comes; returns the exit code.
+
+    Raises:
+        SplatamError: the node cannot start.
+    """
+    with ros(for_ros):
+        node = SplatamNode()
+        logging.getLogger().addHandler(RosLog(node.get_logger()))
+        is_fine = False
+        try:
+            executor = SingleThreadedExecutor()
+            executor.add_node(node)
+            while not (stop.requested or node.is_finished):
+                executor.spin_once(timeout_sec=STEP_S)
+            executor.remove_node(node)
+        finally:
+            is_fine = node.close(lambda: stop.requested)
+    return EXIT_OK if is_fine else EXIT_FAILED
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of what is no ROS argument, which is nothing but ``--help``."""
+    lines = [
+        f'  {setting.name} ({setting.default!r}{" " + setting.unit if setting.unit else ""})\n'
+        + textwrap.fill(_help(setting), HELP_COLUMNS, initial_indent=HELP_INDENT, subsequent_indent=HELP_INDENT)
+        for setting in NODE_SETTINGS
+    ]
+    return argparse.ArgumentParser(
+        PROGRAM,
+        usage='%(prog)s [--ros-args -p NAME:=VALUE ... -r rgb/image:=/TOPIC ...]',
+        description='RGB-D SLAM on rgb/image, depth/image and rgb/camera_info.',
+        epilog='parameters (default), besides the SLAM settings below slam.:\n' + '\n'.join(lines),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def _help(setting: Setting) -> str:
+    return setting.help + (f' One of {", ".join(setting.choices)}.' if setting.choices else '')
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the node; returns the exit code: 0 in good order, 1 SLAM or saving failed, 2 cannot start."""
+    own, for_ros = split_arguments(sys.argv[1:] if arguments is None else arguments)
+    make_parser().parse_args(own)
+    with StopRequest() as stop:
+        try:
+            return run(for_ros, stop)
+        except SplatamError as error:
+            print(f'{PROGRAM}: error: {error}', file=sys.stderr)
+            return EXIT_USAGE
+
+
+if __name__ == '__main__':
+    sys.exit(main())

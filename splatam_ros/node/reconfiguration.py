@@ -1,0 +1,98 @@
+"""Parameters that change while the node runs: checked as a whole, refused with a reason, or handed on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from splatam_core.config import SlamConfig, with_values
+from splatam_core.errors import ConfigError, SplatamError
+from splatam_core.runs.run_folder import check_is_free
+from splatam_core.slam import check_truth
+from splatam_ros.node.map_lifecycle import load_pose
+from splatam_ros.node.parameters import NODE_SETTINGS, SLAM, NodeOptions, field_name, why_fixed
+
+SETTINGS = {setting.name: setting for setting in NODE_SETTINGS}
+
+
+class Reconfiguration:
+    """Takes over parameters that change at run time.
+
+    Attributes:
+        options: the node's parameters as they are now.
+        config: Slam's as they are now.
+    """
+
+    def __init__(
+        self, node: Node, options: NodeOptions, config: SlamConfig,
+        on_options: Callable[[NodeOptions], None], on_config: Callable[[SlamConfig], None],
+    ) -> None:  # fmt: skip
+        """Listen for changes.
+
+        Args:
+            node: whose parameters they are.
+            options: at the start.
+            config: at the start.
+            on_options: called after the node's own parameters have changed.
+            on_config: called after SLAM's have.
+        """
+        self.options = options
+        self.config = config
+        self._node = node
+        self._on_options = on_options
+        self._on_config = on_config
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._apply)
+
+    def _check(self, changes: Sequence[Parameter]) -> SetParametersResult:
+        try:
+            for change in changes:
+                _check_may_change(change.name)
+            options, config = self._changed(changes)
+            check_truth(config, None)
+            if options.save_path != self.options.save_path:
+                check_save_path(options)
+            load_pose(options)
+        except SplatamError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _apply(self, changes: Sequence[Parameter]) -> None:
+        options, config = self._changed(changes)
+        if options != self.options:
+            self.options = options
+            self._on_options(options)
+        if config != self.config:
+            self.config = config
+            self._on_config(config)
+
+    def _changed(self, changes: Sequence[Parameter]) -> tuple[NodeOptions, SlamConfig]:
+        own = {field_name(change.name): SETTINGS[change.name].check(change.value) for change in changes if change.name in SETTINGS}
+        slam = {change.name.removeprefix(SLAM): change.value for change in changes if change.name.startswith(SLAM)}
+        return replace(self.options, **own), with_values(self.config, slam)
+
+
+def _check_may_change(name: str) -> None:
+    if (name in SETTINGS or name.startswith(SLAM)) and (why := why_fixed(name)):
+        raise ConfigError(f'{name} cannot change while the node runs: {why}')
+
+
+def check_save_path(options: NodeOptions) -> None:
+    """Whether a folder that is asked for at run time may be written to.
+
+    Raises:
+        ConfigError: there is no ``save_root``, or the folder is not below it.
+        RunFolderError: something is in the folder.
+    """
+    if not options.save_root:
+        raise ConfigError('save_path cannot change while the node runs: save_root is empty; start the node with it set')
+    root = Path(options.save_root).expanduser().resolve()
+    path = options.folder
+    if path is None or root not in path.resolve().parents:  # links resolved, too
+        raise ConfigError(f"save_path = '{options.save_path}': expected a folder below save_root, which is {root}")
+    check_is_free(path)

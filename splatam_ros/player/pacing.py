@@ -1,0 +1,181 @@
+"""When the player may publish the next message: recording time, and the frames still unanswered."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from splatam_core.geometry.trajectory import stamp_text
+
+
+class PlaybackClock:
+    """Recording time, running at some rate of wall time, and standing still while frozen."""
+
+    def __init__(self, start_ns: int, rate: float | None) -> None:
+        """Start the clock.
+
+        Args:
+            start_ns: recording time now.
+            rate: recording seconds in a wall second; None = as fast as messages can be handed out.
+        """
+        self._rate = rate
+        self._freezes = 0
+        self.restart(start_ns)
+
+    @property
+    def rate(self) -> float | None:
+        """Recording seconds in a wall second; None = as fast as messages can be handed out."""
+        return self._rate
+
+    @rate.setter
+    def rate(self, rate: float | None) -> None:
+        self.restart(self.now_ns())
+        self._rate = rate
+
+    def restart(self, start_ns: int) -> None:
+        """Go to some recording time."""
+        self._anchor_ns = start_ns
+        self._anchor_s = time.monotonic()
+
+    def now_ns(self) -> int:
+        """Recording time now."""
+        if self._rate is None or self._freezes:
+            return self._anchor_ns
+        return self._anchor_ns + round((time.monotonic() - self._anchor_s) * self._rate * 1e9)
+
+    def seconds_until(self, time_ns: int) -> float:
+        """Wall time until a message of this recording time is due; negative when it is late."""
+        return 0.0 if self._rate is None else (time_ns - self.now_ns()) / (self._rate * 1e9)
+
+    def published(self, time_ns: int) -> None:
+        """Tell the clock which message went out; where time does not run by itself, that is what time it is."""
+        if self._rate is None or self._freezes:
+            self._anchor_ns = max(self._anchor_ns, time_ns)
+
+    def freeze(self) -> None:
+        """Stop; undone by as many calls of ``thaw``."""
+        self._anchor_ns = self.now_ns()
+        self._freezes += 1
+
+    def thaw(self) -> None:
+        """Go on from where the clock stopped."""
+        self._freezes -= 1
+        self._anchor_s = time.monotonic()
+
+    @contextmanager
+    def frozen(self) -> Iterator[None]:
+        """Stand still during a ``with``: what held the player up is not caught up afterwards."""
+        self.freeze()
+        try:
+            yield
+        finally:
+            self.thaw()
+
+
+class Lateness:
+    """How late messages went out, by the wall clock, the last of them."""
+
+    KEPT = 100_000
+
+    def __init__(self) -> None:
+        self._late_s: deque[float] = deque(maxlen=self.KEPT)
+
+    def add(self, seconds: float) -> None:
+        """Of one message."""
+        self._late_s.append(max(0.0, seconds))
+
+    @property
+    def p95_ms(self) -> float | None:
+        """What 95 % of the messages keep to, milliseconds; None before the first."""
+        late_s = sorted(self._late_s)
+        return 1e3 * late_s[math.ceil(0.95 * len(late_s)) - 1] if late_s else None
+
+
+@dataclass(slots=True)
+class HandedOut:
+    """A colour image that was published and not answered yet.
+
+    Attributes:
+        number: which colour image of the playback, from 1.
+        stamp_ns: its stamp.
+        is_complete: whether its depth has been published too.
+    """
+
+    number: int
+    stamp_ns: int
+    is_complete: bool
+
+    def __str__(self) -> str:
+        return f'{stamp_text(self.stamp_ns)} (image {self.number})'
+
+
+class Backlog:
+    """Frames handed out and not answered. A frame is a colour image with its depth image.
+
+    An image whose partner the recording lacks is no frame: nobody can answer it.
+    """
+
+    PAIR_WITHIN_NS = 20_000_000  # the node's sync.max_interval
+    NUM_DEPTHS = 100  # remembered; messages of one instant are close together in a recording
+
+    def __init__(self, needs_depth: bool) -> None:
+        """Start empty.
+
+        Args:
+            needs_depth: whether a colour image is a frame only with its depth image.
+        """
+        self.num_colors = 0
+        self._num_unpaired = 0
+        self._needs_depth = needs_depth
+        self._unanswered: deque[HandedOut] = deque()
+        self._depths_ns: deque[int] = deque(maxlen=self.NUM_DEPTHS)
+
+    @property
+    def waiting(self) -> int:
+        """Frames that somebody should answer."""
+        return sum(image.is_complete for image in self._unanswered)
+
+    @property
+    def first(self) -> HandedOut | None:
+        """The first frame not answered."""
+        return next((image for image in self._unanswered if image.is_complete), None)
+
+    @property
+    def num_unpaired(self) -> int:
+        """Colour images without a depth image."""
+        return self._num_unpaired + sum(not image.is_complete for image in self._unanswered)
+
+    def color(self, stamp_ns: int) -> None:
+        """A colour image was published."""
+        self.num_colors += 1
+        is_complete = not self._needs_depth or any(self._pairs(stamp_ns, depth_ns) for depth_ns in self._depths_ns)
+        self._unanswered.append(HandedOut(self.num_colors, stamp_ns, is_complete))
+
+    def depth(self, stamp_ns: int) -> None:
+        """A depth image was published."""
+        self._depths_ns.append(stamp_ns)
+        for image in self._unanswered:
+            image.is_complete |= self._pairs(image.stamp_ns, stamp_ns)
+
+    def answered(self, stamp_ns: int) -> None:
+        """The frame of this stamp is done, and so is whatever came before it."""
+        while self._unanswered and self._unanswered[0].stamp_ns <= stamp_ns:
+            image = self._unanswered.popleft()
+            self._num_unpaired += not image.is_complete and image.stamp_ns != stamp_ns
+
+    def all_answered(self) -> None:
+        """Everything handed out so far has arrived."""
+        self._unanswered.clear()
+
+    def restart(self) -> None:
+        """The recording starts over: old stamps say nothing about new ones."""
+        self._num_unpaired = self.num_unpaired
+        self._unanswered.clear()
+        self._depths_ns.clear()
+
+    def _pairs(self, color_ns: int, depth_ns: int) -> bool:
+        return abs(color_ns - depth_ns) <= self.PAIR_WITHIN_NS

@@ -1,0 +1,147 @@
+"""How to play: what the command line asks for, of this recording."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+
+from splatam_ros.player.offered_qos import Policies, read_overrides
+from splatam_ros.player.recording import Recording
+from splatam_ros.process import RosError
+
+ANSWERS = ('/splatam/pose', '/splatam/processed')
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How to play.
+
+    Attributes:
+        topics: names of the topics to play, as recorded.
+        remap: from recorded names to names on the graph.
+        qos: by recorded name, what the user says about the QoS.
+        must_arrive: offer reliability where best effort was recorded.
+        start_ns: recording time of the beginning.
+        end_ns: recording time of the end, inclusive.
+        rate: recording seconds in a wall second; None = as fast as the listeners allow.
+        delay_s: wall time before the first message, in every loop.
+        loop: start over at the end.
+        clock_hz: how often to publish ``/clock``; None = not periodically.
+        clock_topics: recorded topics before whose messages ``/clock`` is published.
+        start_paused: wait for a key or a service before the first message.
+        read_ahead: most messages to read before they are due.
+        wait_for: the topics that answer frames: the first must come up, the others may. Empty = the transport.
+        max_ahead: frames handed out beyond the newest answer.
+        wait_timeout_s: longest wait for an answer.
+        acknowledge_timeout_s: longest wait, at the end, until subscribers have everything.
+        wait_for_subscribers: wait until the images are subscribed to, and stop when they no longer are.
+        discovery_timeout_s: longest wait for subscribers and for the answering topic.
+    """
+
+    topics: tuple[str, ...]
+    remap: Mapping[str, str]
+    qos: Mapping[str, Policies]
+    must_arrive: bool
+    start_ns: int
+    end_ns: int
+    rate: float | None
+    delay_s: float
+    loop: bool
+    clock_hz: float | None
+    clock_topics: frozenset[str]
+    start_paused: bool
+    read_ahead: int
+    wait_for: tuple[str, ...]
+    max_ahead: int
+    wait_timeout_s: float
+    acknowledge_timeout_s: float
+    wait_for_subscribers: bool
+    discovery_timeout_s: float
+
+
+def make_options(args: argparse.Namespace, recording: Recording) -> Options:
+    """What the command line asks for, of this recording.
+
+    Raises:
+        RosError: a topic is not in it, nothing is left to play, or the QoS file cannot be used.
+    """
+    remap = dict(args.remap)
+    qos = read_overrides(args.qos_profile_overrides_path) if args.qos_profile_overrides_path else {}
+    named = [*(args.topics or []), *args.exclude_topics, *args.clock_topics, *remap, *qos]
+    _require_known(named, recording)
+    topics = _choose_topics(args, recording)
+    start_ns, end_ns = _cut(args, recording)
+    wait_for = ANSWERS if args.wait_for == ANSWERS[0] else (args.wait_for,) if args.wait_for else ()
+    return Options(
+        topics=topics,
+        remap=remap,
+        qos=qos,
+        must_arrive=bool(wait_for) or not args.rate,
+        start_ns=start_ns,
+        end_ns=end_ns,
+        rate=args.rate or None,
+        delay_s=args.delay,
+        loop=args.loop,
+        clock_hz=args.clock,
+        clock_topics=frozenset(topics if args.clock_topics_all else args.clock_topics),
+        start_paused=args.start_paused,
+        read_ahead=args.read_ahead_queue_size,
+        wait_for=wait_for,
+        max_ahead=args.max_ahead,
+        wait_timeout_s=args.wait_timeout,
+        acknowledge_timeout_s=_acknowledge_timeout_s(args),
+        wait_for_subscribers=not args.no_wait_for_subscribers,
+        discovery_timeout_s=args.discovery_timeout,
+    )
+
+
+def _require_known(names: Iterable[str], recording: Recording) -> None:
+    known = {**recording.topics, **recording.skipped}
+    for name in names:
+        if name not in known:
+            raise RosError(f'{name} is not in {recording.path}, which holds {", ".join(sorted(known))}')
+
+
+def _choose_topics(args: argparse.Namespace, recording: Recording) -> tuple[str, ...]:
+    """Named or matching ones, all where neither is asked for; without those to leave out and without a second clock."""
+    makes_clock = args.clock or args.clock_topics or args.clock_topics_all
+    excluded = {*args.exclude_topics, *(['/clock'] if makes_clock else [])}
+    chosen = tuple(
+        name
+        for name in recording.topics
+        if _is_asked_for(name, args.topics, args.regex)
+        and name not in excluded
+        and not (args.exclude_regex and args.exclude_regex.search(name))
+    )
+    if not chosen:
+        raise RosError(f'{recording.path}: no topic is left to play of {", ".join(sorted(recording.topics)) or "none"}')
+    return chosen
+
+
+def _is_asked_for(name: str, topics: Collection[str] | None, regex: re.Pattern[str] | None) -> bool:
+    if topics is None and regex is None:
+        return True
+    return name in (topics or ()) or (regex is not None and regex.search(name) is not None)
+
+
+def _cut(args: argparse.Namespace, recording: Recording) -> tuple[int, int]:
+    """Recording time of beginning and end."""
+    if args.start_offset > recording.duration_s:
+        raise RosError(f'--start-offset {args.start_offset:g}: the recording lasts {recording.duration_s:.1f} s')
+    start_ns = recording.start_ns + round(args.start_offset * 1e9)
+    end_ns = recording.end_ns
+    if args.duration is not None:
+        end_ns = min(end_ns, start_ns + round(args.duration * 1e9))
+    if args.until_ns is not None:
+        end_ns = min(end_ns, args.until_ns)
+    if end_ns < start_ns:
+        raise RosError(f'--playback-until {args.until_ns / 1e9:.9f} s: playback starts at {start_ns / 1e9:.9f} s of the recording')
+    return start_ns, end_ns
+
+
+def _acknowledge_timeout_s(args: argparse.Namespace) -> float:
+    if args.wait_for_all_acked is None:
+        return args.wait_timeout
+    return args.wait_for_all_acked / 1e3 or float('inf')

@@ -1,0 +1,60 @@
+"""Publishes ``/clock`` from the recording's time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection
+
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+
+from msg_adapters import stamps
+from splatam_ros.player.pacing import PlaybackClock
+
+
+class SimClock:
+    """Periodically, just before messages of some topics, or both. Time goes back only where playback does."""
+
+    def __init__(self, node: Node, clock: PlaybackClock, rate_hz: float | None, before: Collection[str]) -> None:
+        """Prepare.
+
+        Args:
+            node: to publish with; it does so only where there is something to publish.
+            clock: of playback.
+            rate_hz: updates a second, wall time; None = none.
+            before: the recorded topics before whose messages there is one.
+        """
+        self._publisher = node.create_publisher(Clock, '/clock', 10) if rate_hz or before else None
+        self._clock = clock
+        self._period_s = 1 / rate_hz if rate_hz else float('inf')
+        self._before = before
+        self._due_s = 0.0
+        self._last_ns = 0
+
+    @property
+    def period_s(self) -> float:
+        """Wall time between two updates; infinite without."""
+        return self._period_s
+
+    def restart(self) -> None:
+        """Time may go back once."""
+        self._last_ns = 0
+
+    def tick(self) -> None:
+        """Publish what is due."""
+        now_s = time.monotonic()
+        if self._period_s < float('inf') and now_s >= self._due_s:
+            self._due_s = now_s + self._period_s
+            self._publish(self._clock.now_ns())
+
+    def message_due(self, topic: str, time_ns: int) -> None:
+        """Tell that a message is about to be published."""
+        if topic in self._before:
+            self._publish(time_ns)
+
+    def _publish(self, time_ns: int) -> None:
+        if self._publisher is not None:
+            self._last_ns = max(self._last_ns, time_ns)
+            message = Clock()
+            message.clock.sec, message.clock.nanosec = stamps.from_ns(self._last_ns)
+            self._publisher.publish(message)
