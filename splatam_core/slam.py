@@ -99,14 +99,14 @@ class Slam:
         if tracking.failure:
             self._motion.stop()
             return self._result(index, frame, Status.LOST, None, False, clock, tracking.failure,
-                                tracking.sure_fraction, tracking.inlier_fraction)  # fmt: skip
+                                tracking.visible_fraction, tracking.inlier_fraction)  # fmt: skip
 
         T_world_cam = se3.inverse(tracking.T_cam_world)
         # Depth sets the pace: a colour frame that comes late, or twice, says little about how the camera moves.
         self._motion.observe(frame.stamp_ns, se3.inverse(tracking.T_cam_world_depth))
-        is_keyframe = self._mapper.add(index, kept, view, tracking.T_cam_world, tracking.sure_fraction, clock)
+        is_keyframe = self._mapper.add(index, kept, view, tracking.T_cam_world, tracking.visible_fraction, clock)
         return self._result(index, frame, Status.TRACKED, T_world_cam, is_keyframe, clock, '',
-                            tracking.sure_fraction, tracking.inlier_fraction)  # fmt: skip
+                            tracking.visible_fraction, tracking.inlier_fraction)  # fmt: skip
 
     def configure(self, config: SlamConfig) -> None:
         """Use other settings from the next frame on; seed, threads, device, rasterizer and motion model stay as they are.
@@ -226,11 +226,11 @@ class Slam:
 
     def _result(
         self, index: int, frame: RgbdFrame, status: Status, T_world_cam: Matrix | None, is_keyframe: bool,
-        clock: Stopwatch, reason: str, sure_fraction: float, inlier_fraction: float,
+        clock: Stopwatch, reason: str, visible_fraction: float, inlier_fraction: float,
     ) -> FrameResult:  # fmt: skip
         return FrameResult(
             index, frame.stamp_ns, status, T_world_cam, is_keyframe, self.num_gaussians,
-            sure_fraction, inlier_fraction, reason, clock.timings(),
+            visible_fraction, inlier_fraction, reason, clock.timings(),
         )  # fmt: skip
 
 

@@ -63,8 +63,8 @@ class FrameResult:
         T_world_cam: [4, 4] float64, camera to world; None exactly when lost.
         is_keyframe: whether the frame was kept for later mapping.
         num_gaussians: size of the map after this frame.
-        sure_fraction: share of the pixels with depth that saw sure map at the tracked pose.
-        inlier_fraction: share of those that agree with the map in depth and colour.
+        visible_fraction: fraction of the pixels with a depth reading that see the map at the tracked pose.
+        inlier_fraction: fraction of those that agree with the map in depth and colour.
         reason: why the frame is lost; empty otherwise.
         timings: where the time went.
     """
@@ -75,7 +75,7 @@ class FrameResult:
     T_world_cam: NDArray[np.float64] | None
     is_keyframe: bool
     num_gaussians: int
-    sure_fraction: float
+    visible_fraction: float
     inlier_fraction: float
     reason: str
     timings: StageTimings

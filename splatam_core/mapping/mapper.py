@@ -57,7 +57,7 @@ class Mapper:
         """Other settings from the next frame on; the seed stays as it is."""
         self.config, self.keyframes.config = config, config.keyframes
 
-    def add(self, index: int, kept: View, view: View, T_cam_world: Matrix, sure_fraction: float, clock: Stopwatch) -> bool:
+    def add(self, index: int, kept: View, view: View, T_cam_world: Matrix, visible_fraction: float, clock: Stopwatch) -> bool:
         """Densify, choose a window, refine; keep the view that was fitted if it is due.
 
         Args:
@@ -65,7 +65,7 @@ class Mapper:
             kept: the frame, in the host's memory.
             view: the same on the device.
             T_cam_world: [4, 4] where it was taken from.
-            sure_fraction: share of its pixels that see sure map.
+            visible_fraction: fraction of its pixels with depth that see the map.
             clock: is told when a stage ends.
 
         Returns:
@@ -81,7 +81,7 @@ class Mapper:
         to_fit = current if keyframe.view is kept else keyframe.to(self._device)
         mapped, every = divmod(index, config.mapping.every)
         if every == 0:
-            if mapped % config.densification.every == 0 or sure_fraction < config.densification.when_unsure:
+            if mapped % config.densification.every == 0 or visible_fraction < config.densification.when_unsure:
                 densify(self.map, view, current.T_cam_world, self._rasterizer, config.densification)
                 clock.lap('densify')
             if not len(self.map):

@@ -124,7 +124,7 @@ class FrameRecord:
         status: what became of it.
         is_keyframe: whether it was kept for mapping.
         num_gaussians: size of the map after it.
-        sure_fraction: see ``FrameResult``.
+        visible_fraction: see ``FrameResult``.
         inlier_fraction: see ``FrameResult``.
         process_ms: wall time in SLAM.
         decode_ms: wall time reading and decoding it; None where that went on beside SLAM.
@@ -136,7 +136,7 @@ class FrameRecord:
     status: Status
     is_keyframe: bool
     num_gaussians: int
-    sure_fraction: float
+    visible_fraction: float
     inlier_fraction: float
     process_ms: float
     decode_ms: float | None
@@ -608,7 +608,7 @@ def _record(result: FrameResult, process_s: float, decode_s: float | None) -> Fr
         status=result.status,
         is_keyframe=result.is_keyframe,
         num_gaussians=result.num_gaussians,
-        sure_fraction=result.sure_fraction,
+        visible_fraction=result.visible_fraction,
         inlier_fraction=result.inlier_fraction,
         process_ms=process_s * 1e3,
         decode_ms=None if decode_s is None else decode_s * 1e3,
@@ -622,7 +622,7 @@ def _rate(frames: int, wall_ms: float) -> float | None:
 
 
 _CSV_HEADER = [
-    'stamp', 'status', 'is_keyframe', 'num_gaussians', 'sure_fraction', 'inlier_fraction', 'process_ms', 'decode_ms',
+    'stamp', 'status', 'is_keyframe', 'num_gaussians', 'visible_fraction', 'inlier_fraction', 'process_ms', 'decode_ms',
     *(f'{stage}_ms' for stage in STAGES), 'reason',
 ]  # fmt: skip
 
@@ -631,7 +631,7 @@ def _csv_row(record: FrameRecord) -> list[str]:
     times_ms = [getattr(record.timings, stage) for stage in STAGES]
     return [
         stamp_text(record.stamp_ns), record.status.value, str(int(record.is_keyframe)), str(record.num_gaussians),
-        f'{record.sure_fraction:.4f}', f'{record.inlier_fraction:.4f}', f'{record.process_ms:.3f}',
+        f'{record.visible_fraction:.4f}', f'{record.inlier_fraction:.4f}', f'{record.process_ms:.3f}',
         '' if record.decode_ms is None else f'{record.decode_ms:.3f}', *(f'{time_ms:.3f}' for time_ms in times_ms),
         record.reason,
     ]  # fmt: skip
@@ -660,7 +660,7 @@ def _frame_record(row: dict[str, str]) -> FrameRecord:
         status=Status(row['status']),
         is_keyframe=row['is_keyframe'] == '1',
         num_gaussians=int(row['num_gaussians']),
-        sure_fraction=float(row['sure_fraction']),
+        visible_fraction=float(row.get('visible_fraction') or row['sure_fraction']),  # the column's name in 0.1.0
         inlier_fraction=float(row['inlier_fraction']),
         process_ms=float(row['process_ms']),
         decode_ms=float(row['decode_ms']) if row['decode_ms'] else None,

@@ -91,10 +91,10 @@ class AlignmentTracker:
         alignment = self._align(references, frames, before)
         fit = alignment.fit
         readings = int((frames[0].depth > 0).sum())
-        sure_fraction, inlier_fraction = fit.compared / max(1, readings), fit.agreeing / max(1, fit.compared)
+        visible_fraction, inlier_fraction = fit.compared / max(1, readings), fit.agreeing / max(1, fit.compared)
         at_color, at_depth = alignment.state.light_motion @ T_cam_world, alignment.state.motion @ T_cam_world
-        reason = failure(at_color, readings, sure_fraction, inlier_fraction, self._config)
-        return TrackingResult(at_color, at_depth, sure_fraction, inlier_fraction, reason)
+        reason = failure(at_color, readings, visible_fraction, inlier_fraction, self._config)
+        return TrackingResult(at_color, at_depth, visible_fraction, inlier_fraction, reason)
 
     def _references(self, gaussians: Gaussians, full: PinholeCamera, finest: PinholeCamera, T_cam_world: Matrix) -> list[_Picture]:
         """The map from the first guess, at the resolutions of ``_levels``."""

@@ -26,14 +26,14 @@ class TrackingResult:
     Attributes:
         T_cam_world: [4, 4] float64, when colour was taken.
         T_cam_world_depth: [4, 4] float64, when depth was taken; the same for trackers that take the two to be one.
-        sure_fraction: share of the pixels with depth that see sure map.
-        inlier_fraction: share of those that agree with the map in depth and colour.
+        visible_fraction: fraction of the pixels with a depth reading that see the map at the pose.
+        inlier_fraction: fraction of those that agree with the map in depth and colour.
         failure: why the pose must not be used; empty where it may be.
     """
 
     T_cam_world: Matrix
     T_cam_world_depth: Matrix
-    sure_fraction: float
+    visible_fraction: float
     inlier_fraction: float
     failure: str
 
@@ -102,22 +102,22 @@ def judge(T_cam_world: NDArray[np.float64], render: Render, view: View, config: 
     depth_agrees = (render.depth() - view.depth).abs() <= config.inlier_depth * view.depth
     color_agrees = (render.rgb - view.rgb).abs().mean(dim=0) <= config.inlier_color
     counts = torch.stack([view.valid.sum(), sure.sum(), (sure & depth_agrees & color_agrees).sum()])
-    readings, num_sure, num_inliers = counts.tolist()
-    sure_fraction, inlier_fraction = num_sure / max(1, readings), num_inliers / max(1, num_sure)
-    reason = failure(T_cam_world, readings, sure_fraction, inlier_fraction, config)
-    return TrackingResult(T_cam_world, T_cam_world, sure_fraction, inlier_fraction, reason)
+    readings, num_visible, num_inliers = counts.tolist()
+    visible_fraction, inlier_fraction = num_visible / max(1, readings), num_inliers / max(1, num_visible)
+    reason = failure(T_cam_world, readings, visible_fraction, inlier_fraction, config)
+    return TrackingResult(T_cam_world, T_cam_world, visible_fraction, inlier_fraction, reason)
 
 
 def failure(
-    T_cam_world: NDArray[np.float64], readings: int, sure_fraction: float, inlier_fraction: float, config: TrackingConfig
+    T_cam_world: NDArray[np.float64], readings: int, visible_fraction: float, inlier_fraction: float, config: TrackingConfig
 ) -> str:
     """Why a pose must not be used; empty where it may be."""
     if not np.isfinite(T_cam_world).all():
         return 'tracking diverged: the pose is not finite'
     if readings == 0:
         return 'no pixel has a usable depth reading'
-    if sure_fraction < config.min_sure_fraction:
-        return f'only {sure_fraction:.0%} of the view is mapped (at least {config.min_sure_fraction:.0%} needed)'
+    if visible_fraction < config.min_sure_fraction:
+        return f'only {visible_fraction:.0%} of the view is mapped (at least {config.min_sure_fraction:.0%} needed)'
     if inlier_fraction < config.min_inlier_fraction:
         return f'only {inlier_fraction:.0%} of it agrees with the map (at least {config.min_inlier_fraction:.0%} needed)'
     return ''

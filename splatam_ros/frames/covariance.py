@@ -56,7 +56,7 @@ class MotionEstimator:
 
     def observe(self, located: Located, result: FrameResult) -> Motion:
         """Take a tracked pose."""
-        covariance = self._pose_covariance(located, result.sure_fraction * result.inlier_fraction)
+        covariance = self._pose_covariance(located, result.visible_fraction * result.inlier_fraction)
         previous, self._previous = self._previous, (located, covariance)
         if previous is None:
             return Motion(covariance, np.zeros(6), UNKNOWN_VARIANCE * np.eye(6))

@@ -147,7 +147,7 @@ def tracking_report(now: Sample) -> Report:
         return Report('tracking', WARN, 'no frame yet', values)
     values |= {
         'status': result.status.value,
-        'share of the view that is mapped': f'{result.sure_fraction:.2f}',
+        'share of the view that is mapped': f'{result.visible_fraction:.2f}',
         'share of it that agrees with the map': f'{result.inlier_fraction:.2f}',
         'stamp': f'{result.stamp_ns / 1e9:.6f}',
     }

@@ -79,6 +79,14 @@ def test_what_was_written_is_read_back(tmp_path: Path) -> None:
     assert run.frames[1].timings == results[1].timings
 
 
+def test_frames_of_an_older_version_are_read(tmp_path: Path) -> None:
+    with RunFolder.create(tmp_path, CONFIG, OFFLINE) as folder:
+        folder.append(frame(0), result(0, Status.INITIALIZED), 0.25, 0.125)
+    frames = tmp_path / 'frames.csv'
+    frames.write_text(frames.read_text().replace('visible_fraction', 'sure_fraction'))
+    assert read_run(tmp_path).frames[0].visible_fraction == result(0, Status.INITIALIZED).visible_fraction
+
+
 def test_run_json_says_what_ran_where(tmp_path: Path) -> None:
     RunFolder.create(tmp_path, CONFIG, OFFLINE).close()
     information = json.loads((tmp_path / 'run.json').read_text())

@@ -171,7 +171,7 @@ def test_a_view_of_somewhere_else_is_lost(room: tuple[list[RgbdFrame], list[np.n
         slam.process(frame)
     stranger = open_sequence('synthetic:seed=5', width=WIDTH)[150]
     result = slam.process(dataclasses.replace(stranger, stamp_ns=frames[3].stamp_ns))
-    assert result.status is Status.LOST, (result.sure_fraction, result.inlier_fraction)
+    assert result.status is Status.LOST, (result.visible_fraction, result.inlier_fraction)
 
 
 def test_frames_it_cannot_take_are_refused_and_change_nothing(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
