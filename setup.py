@@ -122,6 +122,7 @@ setup(
     extras_require={
         'exr': ['OpenEXR>=3.3'],
         'lpips': ['lpips>=0.1.4'],
+        'lint': ['mypy>=1.11', 'ruff>=0.8', 'types-PyYAML>=6.0', 'types-tqdm>=4.60'],
         'mesh': ['open3d>=0.18'],
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
