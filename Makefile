@@ -1,4 +1,4 @@
-# `make demo` on a fresh machine sets everything up and takes the whole path once.
+# `make demo` on a fresh machine sets everything up and plays a recording through the node. `make help` lists the targets.
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
@@ -10,21 +10,26 @@ CSRC := $(wildcard splatam_core/csrc/*)
 FINDABLE = $(foreach name,python3 python3.12 python3.11 python3.10,$(shell $(name) -c '$(CHECK_PYTHON)' 2>/dev/null && echo $(name)))
 CHECK_PYTHON := import sys; sys.exit(0 if (3, 10) <= sys.version_info < (3, 13) else 1)
 PYTHON ?= $(firstword $(FINDABLE))
+TEST_WORKERS ?= 2
 export SPLATAM_DATA ?= $(abspath ../shared/data)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup test lint tf2_msgs demo paper-tables colcon check-aarch64 clean
+.PHONY: help setup test test-quick lint format docs hooks tf2_msgs demo paper-tables colcon check-aarch64 clean
 
 help:
-	@echo 'make setup           make $(VENV) with everything in it (PYTHON=python3.11 chooses the interpreter)'
-	echo 'make test            run the whole test suite'
-	echo 'make lint            style and likely mistakes, by ruff'
-	echo 'make tf2_msgs        build the messages of /tf into $(VENV), for a ROS from pip, which lacks them'
-	echo 'make demo [BAG=path] play a recording into the node and score what comes out, in out/demo'
-	echo 'make paper-tables    ablations, metrics and held-out views on the recordings in SPLATAM_DATA: hours, and goes on where it stopped'
-	echo 'make colcon          build and test as a ROS package, in a scratch workspace'
-	echo 'make check-aarch64   compile the kernels for the processors of robots'
-	echo 'make clean           remove what was built; $(VENV) and out stay'
+	@echo 'make setup           create $(VENV), build the native code and install the package (PYTHON=python3.11 chooses the interpreter)'
+	echo 'make test-quick      run the fast tests: no ROS processes, no recordings, under 2 minutes'
+	echo 'make test            run every test, $(TEST_WORKERS) at a time (TEST_WORKERS=4 changes that)'
+	echo 'make lint            check style, types and spelling: ruff, mypy, codespell, clang-format'
+	echo 'make format          rewrite Python and C++ files in the project'"'"'s format'
+	echo 'make docs            build the documentation site in build/site and check its links'
+	echo 'make hooks           run the checks of pre-commit at every git commit'
+	echo 'make tf2_msgs        build the messages of /tf into $(VENV), for a ROS that pip installed, which lacks them'
+	echo 'make demo [BAG=path] play a recording into the node and score the result, in out/demo'
+	echo 'make paper-tables    run ablations, metrics and held-out views on the recordings in SPLATAM_DATA: hours; continues where it stopped'
+	echo 'make colcon          build and test as a ROS package, in a temporary workspace'
+	echo 'make check-aarch64   compile the native code for 64-bit ARM'
+	echo 'make clean           remove build results; keep $(VENV) and out'
 
 setup: $(VENV)/.native $(VENV)/.installed
 
@@ -34,19 +39,25 @@ $(VENV)/.created:
 	$(PYTHON) -m venv $(VENV) || { echo '$(PYTHON) cannot make a virtual environment: apt install python3-venv' >&2; exit 1; }
 	touch $@
 
-# The kernels come first: what a machine lacks to compile them should be said before the long download.
+# The native code comes first, so that a missing compiler is reported before the long download.
 $(VENV)/.native: $(CSRC) setup.py package.xml constraints.txt | $(VENV)/.created
-	@echo 'building the kernels'
+	@echo 'building the native code'
 	$(BIN)/python -m pip install --quiet -c constraints.txt setuptools pybind11
 	$(BIN)/python setup.py --quiet build_ext --inplace --force
 	touch $@
 
-$(VENV)/.installed: setup.py package.xml pyproject.toml constraints.txt | $(VENV)/.native
-	@echo 'installing what splatam_ros needs into $(VENV): some minutes the first time'
+$(VENV)/.installed: setup.py setup.cfg package.xml pyproject.toml constraints.txt | $(VENV)/.native
+	@echo 'installing the requirements of splatam_ros into $(VENV): some minutes the first time'
 	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[ros,test]'
 	touch $@
 
-# TF for a ROS that comes from pip, which has no tf2_msgs; where ROS is installed it is there already.
+# The tools of `make lint`, `make docs` and `make hooks`.
+$(VENV)/.tools: setup.py constraints.txt docs/requirements.txt | $(VENV)/.installed
+	@echo 'installing the tools for lint and docs into $(VENV)'
+	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[lint]' -r docs/requirements.txt
+	touch $@
+
+# ROS from pip has no tf2_msgs. An installed ROS has it already.
 tf2_msgs: $(VENV)/.tf2_msgs
 $(VENV)/.tf2_msgs: tools/tf2_msgs.py | $(VENV)/.installed
 	@echo 'generating tf2_msgs into $(VENV)'
@@ -54,11 +65,32 @@ $(VENV)/.tf2_msgs: tools/tf2_msgs.py | $(VENV)/.installed
 	touch $@
 
 test: setup tf2_msgs
-	@$(BIN)/python -m pytest -q
+	@$(BIN)/python -m pytest -q -n $(TEST_WORKERS) --dist worksteal
 
-lint: $(VENV)/.created
-	@$(BIN)/python -m pip install --quiet -c constraints.txt ruff
-	$(BIN)/python -m ruff check .
+test-quick: setup
+	@$(BIN)/python -m pytest -q -n $(TEST_WORKERS) --dist worksteal -m 'not slow and not ros and not recording'
+
+# Runs every check, also after one has failed, and names those that failed.
+lint: $(VENV)/.tools
+	@failed=()
+	check() { echo "== $$*"; "$(BIN)/$$1" "$${@:2}" || failed+=("$$1 $$2"); }
+	check ruff check --quiet .
+	check ruff format --quiet --check .
+	check mypy --no-error-summary
+	check codespell
+	check clang-format --dry-run --Werror $(CSRC)
+	if (( $${#failed[@]} )); then printf 'make lint: failed: %s\n' "$$(IFS=,; echo "$${failed[*]}")" >&2; exit 1; fi
+
+format: $(VENV)/.tools
+	@$(BIN)/ruff check --quiet --fix .
+	$(BIN)/ruff format --quiet .
+	$(BIN)/clang-format -i $(CSRC)
+
+docs: $(VENV)/.tools
+	@$(BIN)/python -m mkdocs build --strict --quiet
+
+hooks: $(VENV)/.tools
+	@$(BIN)/pre-commit install
 
 demo: setup
 	@$(BIN)/python -m splatam_ros.demo $(if $(BAG),'$(BAG)')
@@ -66,7 +98,7 @@ demo: setup
 paper-tables: setup
 	@$(BIN)/python benchmarks/paper_tables.py --data "$$SPLATAM_DATA"
 
-# A ROS workspace as colcon sees it, outside the checkout; its virtual environment does not hold splatam_ros.
+# Builds in a workspace outside the checkout, with a virtual environment that does not hold splatam_ros.
 colcon: $(VENV)/.created
 	@scratch=$$(mktemp -d)
 	trap 'rm -rf "$$scratch"' EXIT
@@ -75,7 +107,7 @@ colcon: $(VENV)/.created
 	git ls-files -z --cached --others --exclude-standard | xargs -0 cp --parents -t "$$package"
 	$(BIN)/python -m venv "$$venv"
 	export PATH=$$venv/bin:$$PATH AMENT_PREFIX_PATH=$$venv CMAKE_PREFIX_PATH=$$venv
-	echo 'installing colcon and what splatam_ros needs: some minutes'
+	echo 'installing colcon and the requirements of splatam_ros: some minutes'
 	pip install --quiet -c constraints.txt "$$package[ros,test]" pybind11
 	pip uninstall --quiet --yes splatam_ros
 	pip install --quiet colcon-common-extensions
@@ -85,7 +117,7 @@ colcon: $(VENV)/.created
 	colcon test
 	colcon test-result --all --verbose
 
-# Everything but running it: the shipping flags, a cross compiler, and this machine's Python headers.
+# Compiles with the release flags, a cross compiler and this machine's Python headers. The result cannot run here.
 ARM := aarch64-linux-gnu
 check-aarch64: $(VENV)/.native
 	@if ! command -v $(ARM)-g++ >/dev/null; then echo 'skipped: no $(ARM)-g++ (apt install g++-$(ARM))'; exit 0; fi
@@ -98,6 +130,6 @@ check-aarch64: $(VENV)/.native
 	$(ARM)-readelf -h $$(find build/aarch64 -name '_native*.so') | grep -E 'Class|Machine'
 
 clean:
-	@rm -rf build dist install log *.egg-info .pytest_cache .hypothesis .ruff_cache
+	@rm -rf build dist install log *.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	rm -f splatam_core/_native*.so $(VENV)/.native
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +

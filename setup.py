@@ -26,8 +26,8 @@ SYSTEM_PYBIND11 = Path('/usr/include/pybind11/pybind11.h')
 
 HAS_TRITON_WHEEL = "sys_platform == 'linux' and (platform_machine == 'x86_64' or platform_machine == 'aarch64')"
 
-# No -ffast-math and no -march: NaN must stay NaN, and one build must run on every processor of its kind.
-# No -Wpsabi: it warns that wide vectors cross function calls differently per processor; ours cross none.
+# No -ffast-math: NaN must stay NaN. No -march: one build must run on every processor of the same architecture.
+# -Wno-psabi: the warning is about passing wide vectors between functions, which this code does not do.
 COMPILE_FLAGS = [
     '-std=c++17', '-O3', '-g0', '-fno-math-errno', '-fno-trapping-math', '-fvisibility=hidden', '-pthread',
     '-Wno-psabi',
@@ -35,7 +35,7 @@ COMPILE_FLAGS = [
 
 
 def pybind11_include_dirs() -> list[str] | None:
-    """Where the pybind11 headers are; None where there are none."""
+    """Returns the folders to search for pybind11's headers, or None if pybind11 is not installed."""
     try:
         import pybind11
     except ImportError:
@@ -44,7 +44,7 @@ def pybind11_include_dirs() -> list[str] | None:
 
 
 def missing_for_build() -> str | None:
-    """What has to be installed before the extension can be built, in one line."""
+    """Returns one line that says what to install before the extension can be built, or None if nothing is missing."""
     compiler = shlex.split(os.environ.get('CXX') or sysconfig.get_config_var('CXX') or 'g++')[0]
     if shutil.which(compiler) is None:
         return f"no C++ compiler (looked for '{compiler}'): apt install g++ python3-dev, or set CXX"
@@ -56,22 +56,22 @@ def missing_for_build() -> str | None:
 
 
 class BuildNative(build_ext):
-    """Builds the kernels, once everything they need is there, and leaves them beside their source too.
+    """Builds the native code and copies it into the source tree.
 
-    The checkout itself can then be run and tested, which is what ``colcon test`` does.
+    The copy makes the checkout itself runnable: ``colcon test`` runs the tests there.
     """
 
     def run(self) -> None:
-        """Build, or leave with one line that says what to install."""
+        """Build the extension; exit with one line if something is not installed."""
         if missing := missing_for_build():
             sys.exit(f'{NAME}: {missing}')
         super().run()
-        if not self.inplace and platform.machine() in self.plat_name:  # else it is built for another processor
+        if not self.inplace and platform.machine() in self.plat_name:  # not when cross-compiling
             self.copy_extensions_to_source()
 
 
 def native_extension() -> Extension:
-    """The C++ kernels of the ``cpu`` rasterizer."""
+    """Returns the C++ code of the ``cpu`` rasterizer and of alignment."""
     return Extension(
         'splatam_core._native',
         sources=sorted(glob(f'{CSRC}/*.cpp')),
@@ -84,7 +84,7 @@ def native_extension() -> Extension:
 
 
 def shared_files() -> list[tuple[str, list[str]]]:
-    """What ROS expects below ``share``, and the configuration, folder by folder."""
+    """Returns the files that ROS expects below ``share`` and the configuration, by destination folder."""
     share = f'share/{NAME}'
     by_folder = {
         'share/ament_index/resource_index/packages': [f'resource/{NAME}'],
@@ -110,6 +110,15 @@ setup(
     data_files=shared_files(),
     package_data={'splatam_core.evaluation.report': ['*.html']},
     python_requires='>=3.10',
+    classifiers=[
+        'Intended Audience :: Science/Research',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: C++',
+        'Programming Language :: Python :: 3.10',
+        'Programming Language :: Python :: 3.11',
+        'Programming Language :: Python :: 3.12',
+        'Topic :: Scientific/Engineering :: Image Processing',
+    ],
     install_requires=[
         'matplotlib>=3.6',
         'numpy>=1.26',
@@ -122,15 +131,24 @@ setup(
     extras_require={
         'exr': ['OpenEXR>=3.3'],
         'lpips': ['lpips>=0.1.4'],
-        'lint': ['mypy>=1.11', 'ruff>=0.8', 'types-PyYAML>=6.0', 'types-tqdm>=4.60'],
+        'lint': [
+            'clang-format>=19',
+            'codespell>=2.4',
+            'mypy>=1.11',
+            'pre-commit>=3.5',
+            'ruff>=0.8',
+            'types-PyYAML>=6.0',
+            'types-tqdm>=4.60',
+        ],
         'mesh': ['open3d>=0.18'],
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
             'pytest>=7',
+            'pytest-xdist>=3.5',
             'hypothesis>=6',
             'OpenEXR>=3.3',
             'pytorch-msssim>=1.0',
-            f'triton>=3.4; {HAS_TRITON_WHEEL}',  # interprets the GPU's kernels; torch's CUDA builds bring their own
+            f'triton>=3.4; {HAS_TRITON_WHEEL}',  # interprets the GPU kernels on the CPU; CUDA builds of torch include it
         ],
     },
     entry_points={
