@@ -1,4 +1,4 @@
-"""What crosses the core's boundaries: frames in, results and snapshots out. All immutable."""
+"""Types that cross the core's boundary: frames in, results and snapshots out. All are immutable."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ class RgbdFrame:
         stamp_ns: time of the exposure, integer nanoseconds.
         rgb: [H, W, 3] uint8, RGB.
         depth_m: [H, W] float32 metres along the optical axis; 0 = no reading, never NaN or inf.
-        camera: the pinhole both images were taken with (or rectified to).
-        epoch: how often time had jumped back before; stamps increase within an epoch.
+        camera: pinhole camera of both images, after rectification.
+        epoch: number of backward time jumps before this frame; stamps increase within an epoch.
+        frame_id: coordinate frame of the colour image, as its ROS header names it; empty for recordings without one.
     """
 
     stamp_ns: int
@@ -31,10 +32,11 @@ class RgbdFrame:
     depth_m: NDArray[np.float32]
     camera: PinholeCamera
     epoch: int = 0
+    frame_id: str = ''
 
 
 class Status(str, Enum):
-    """What became of a frame."""
+    """Outcome of tracking one frame."""
 
     INITIALIZED = 'initialized'
     TRACKED = 'tracked'
@@ -43,7 +45,7 @@ class Status(str, Enum):
 
 @dataclass(frozen=True, slots=True)
 class StageTimings:
-    """Wall time one frame spent in each stage, milliseconds."""
+    """Wall time that one frame took in each stage, in milliseconds."""
 
     track: float = 0.0
     densify: float = 0.0
@@ -54,19 +56,19 @@ class StageTimings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameResult:
-    """What ``Slam.process`` found out about one frame.
+    """What ``Slam.process`` returns for one frame.
 
     Attributes:
         index: number of the frame among those processed, from 0.
         stamp_ns: the frame's stamp.
         status: initialized, tracked or lost.
-        T_world_cam: [4, 4] float64, camera to world; None exactly when lost.
-        is_keyframe: whether the frame was kept for later mapping.
-        num_gaussians: size of the map after this frame.
+        T_world_cam: [4, 4] float64, camera to world; None if and only if the frame is lost.
+        is_keyframe: True if the frame was kept as a keyframe for later mapping.
+        num_gaussians: number of Gaussians in the map after this frame.
         visible_fraction: fraction of the pixels with a depth reading that see the map at the tracked pose.
         inlier_fraction: fraction of those that agree with the map in depth and colour.
         reason: why the frame is lost; empty otherwise.
-        timings: where the time went.
+        timings: wall time of each stage.
     """
 
     index: int
@@ -83,7 +85,7 @@ class FrameResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderedView:
-    """What the map looks like from a pose.
+    """The map rendered from one pose.
 
     Attributes:
         rgb: [H, W, 3] uint8.
@@ -98,14 +100,14 @@ class RenderedView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapSnapshot:
-    """A copy of the map that stays as it was while the map goes on.
+    """A copy of the map that does not change while mapping continues.
 
     Attributes:
         means: [N, 3] float32 metres, world.
         rgb: [N, 3] float32, nominally in [0, 1].
         opacities: [N] float32 in (0, 1).
-        log_scales: [N, 1] float32, log metres; [N, 3] of anisotropic Gaussians.
-        rotations: [N, 4] float32 quaternions (w, x, y, z) of any length, axes to world; None of isotropic Gaussians.
+        log_scales: [N, 1] float32, log metres; [N, 3] for anisotropic Gaussians.
+        rotations: [N, 4] float32 quaternions (w, x, y, z) of any length, axes to world; None for isotropic Gaussians.
     """
 
     means: NDArray[np.float32]
