@@ -7,7 +7,7 @@ from typing import Any
 
 from splatam_core.config import SlamConfig
 from splatam_core.geometry.camera import PinholeCamera
-from splatam_core.mapping.keyframes import PosedView
+from splatam_core.mapping.posed import PosedView
 from splatam_core.tracking.motion import MotionState
 from splatam_core.types import Arrays
 

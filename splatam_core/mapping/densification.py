@@ -13,14 +13,16 @@ from splatam_core.images.view import View, unproject
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.rasterizer import Gaussians, Rasterizer, Render
 
-MAX_BIAS = 0.1  # share of the depth; pixels that are farther off see another surface
+MAX_BIAS = 0.1
+"""As a fraction of the depth. A pixel that is off by more shows another surface."""
+
 BIAS_WINDOW = 5  # pixels
 
 
 def densify(
     gaussian_map: GaussianMap, view: View, T_cam_world: Tensor, rasterizer: Rasterizer, config: DensificationConfig
 ) -> None:
-    """Add the Gaussians that make the map explain the view."""
+    """Adds the Gaussians that make the map explain the view."""
     view = view.narrowed(config.scale, config.max_width)
 
     def render() -> Render:
@@ -29,16 +31,16 @@ def densify(
     with torch.no_grad():
         chosen, depth = unexplained(render(), view, config), view.depth
         gaussian_map.append(new_gaussians(view, chosen, depth, T_cam_world, config.opacity))
-        for _ in range(config.settle):
+        for _ in range(config.bias_correction_rounds):
             depth = depth - depth_bias(render(), view)
             gaussian_map.replace_last(new_gaussians(view, chosen, depth, T_cam_world, config.opacity))
 
 
 def depth_bias(render: Render, view: View) -> Tensor:
-    """[H, W] metres by which the rendered depth is off, averaged over each pixel's surroundings.
+    """Returns [H, W] metres by which the rendered depth is off, averaged over each pixel's surroundings.
 
-    Blending front to back favours the nearer neighbours, so on slanted or noisy surfaces a fresh map renders too near.
-    Only the average is of interest: a pixel's own error is mostly noise, and following it would add to it.
+    Blending front to back favours the nearer neighbours, so a fresh map renders slanted or noisy surfaces too near. Only
+    the average matters: a pixel's own error is mostly noise, and correcting it would add that noise to the map.
     """
     depth = render.depth()
     compared = (view.valid & (depth > 0) & ((depth - view.depth).abs() < MAX_BIAS * view.depth)).float()
@@ -47,9 +49,9 @@ def depth_bias(render: Render, view: View) -> Tensor:
 
 
 def unexplained(render: Render, view: View, config: DensificationConfig) -> Tensor:
-    """[H, W] pixels that see no map, or something new in front of it (paper, eq. 9).
+    """Returns [H, W] which pixels show no map, or something new in front of it (paper, equation 9).
 
-    The median error is taken over the pixels that have both a reading and map behind it.
+    The median depth error is taken over the pixels that have both a reading and a rendered depth.
     """
     unmapped = render.silhouette < config.silhouette_threshold
     depth = render.depth()
@@ -60,7 +62,7 @@ def unexplained(render: Render, view: View, config: DensificationConfig) -> Tens
 
 
 def new_gaussians(view: View, chosen: Tensor, depth: Tensor, T_cam_world: Tensor, opacity: float) -> Gaussians:
-    """One Gaussian per chosen pixel [H, W] at a depth [H, W], one pixel wide, of the pixel's colour."""
+    """Returns one Gaussian for each chosen pixel [H, W]: at a depth [H, W], one pixel wide, in the pixel's colour."""
     v, u = torch.nonzero(chosen, as_tuple=True)
     points = unproject(view.camera, u, v, depth[v, u])  # [K, 3]
     R, t = T_cam_world[:3, :3], T_cam_world[:3, 3]

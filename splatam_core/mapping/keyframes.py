@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,34 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatam_core.config import KeyframeConfig
+from splatam_core.config import KeyframeConfig, SlamConfig
 from splatam_core.geometry.camera import PinholeCamera
-from splatam_core.images.view import View, unproject
+from splatam_core.images.view import unproject
+from splatam_core.mapping.posed import PosedView
 
 _TOGETHER = 64  # keyframes whose overlap is found at once: more would not stay in a core's cache
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PosedView:
-    """A view and where it was taken from.
-
-    Attributes:
-        view: the images.
-        T_cam_world: [4, 4] float32.
-    """
-
-    view: View
-    T_cam_world: Tensor
-
-    def to(self, device: torch.device) -> PosedView:
-        """The same on a device; itself where it is there already."""
-        if self.view.depth.device == device:
-            return self
-        return PosedView(self.view.to(device), self.T_cam_world.to(device, non_blocking=True))
-
-    def bare(self) -> PosedView:
-        """The same without what its view has worked out: seven bytes a pixel."""
-        return PosedView(replace(self.view), self.T_cam_world)
 
 
 class KeyframeStore(Sequence[PosedView]):
@@ -175,21 +152,6 @@ _SELECTIONS = {
 }  # fmt: skip
 
 
-def is_due(index: int, config: KeyframeConfig, num_frames: int | None) -> bool:
-    """Whether a frame is to be kept.
-
-    Args:
-        index: its number, from 0.
-        config: how often.
-        num_frames: of the recording, where that is known.
-    """
-    every = config.every
-    if num_frames is not None and config.at_least:
-        every = min(every, max(1, num_frames // config.at_least))
-    before_last = config.before_last and num_frames is not None and index == num_frames - 2
-    return index % every == 0 or before_last
-
-
 def _seen(
     current: PosedView, keyframes: Sequence[PosedView], config: KeyframeConfig, rng: np.random.Generator
 ) -> NDArray[np.float64]:
@@ -237,6 +199,14 @@ def _may_see(points: Tensor, camera: PinholeCamera, T_cam_world: Tensor) -> Tens
     ):  # fmt: skip
         seen &= focal * across + pixels * z > -radius * math.hypot(focal, pixels)
     return seen
+
+
+def views_to_fit(window: Sequence[PosedView], num_steps: int, config: SlamConfig, rng: np.random.Generator) -> Iterator[PosedView]:
+    """Yields the view of each optimization step: drawn at random from the window, at half size where the rhythm says so."""
+    half_size_every = config.mapping.half_size_every
+    for step in range(num_steps):
+        posed = draw(window, config.keyframes, rng)
+        yield posed.half_size() if half_size_every and step % half_size_every == half_size_every - 1 else posed
 
 
 def draw(window: Sequence[PosedView], config: KeyframeConfig, rng: np.random.Generator) -> PosedView:

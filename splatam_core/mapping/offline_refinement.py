@@ -20,10 +20,13 @@ from splatam_core.geometry import se3
 from splatam_core.images.view import View
 from splatam_core.mapping.adaptive_density import ScreenPull, grow
 from splatam_core.mapping.gaussian_map import GaussianMap
-from splatam_core.mapping.keyframes import PosedView
 from splatam_core.mapping.loss import mapping_loss
-from splatam_core.mapping.optimizers import RESET_OPACITY, prunable, rates
+from splatam_core.mapping.optimizers import prunable, rates
+from splatam_core.mapping.posed import PosedView
 from splatam_core.rasterizer import Gaussians, Rasterizer, Rates
+
+RESET_OPACITY = 0.01
+"""Opacity that the original gives all Gaussians when it resets them, as 3D Gaussian splatting does."""
 
 LAST_RATE = 0.01
 """Of the step sizes at the end, relative to the beginning."""
@@ -75,7 +78,7 @@ def refine_map(
         mapping_loss(render, posed.view, mapping).backward()
         if growth is not None:
             growth.observe(posed)
-        if mapping.prune_every and step % PRUNE_EVERY == 0:
+        if mapping.paper.prune_every and step % PRUNE_EVERY == 0:
             kept = ~prunable(gaussian_map, mapping.prune_opacity, mapping.prune_scale * scene_radius)
             gaussian_map.keep(kept)
             if growth is not None:

@@ -6,7 +6,7 @@ camera moves until the points land on equal brightness and equal depth in the fr
 Kerl et al. 2013: Student-t weights, scales from the data). Colour and depth share one system, so rotation and
 translation, which look alike to first-order steps, are told apart at once. Two more unknowns take up what the camera's
 automatic exposure does to brightness, and one the time by which colour lags depth: few cameras take both at once, and a
-moving one shows them from different places (docs/decisions/0005-lag.md). The pose of a frame is that of its colour.
+moving one shows them from different places (docs/decisions/0005-time-offset.md). The pose of a frame is that of its colour.
 """
 
 from __future__ import annotations
@@ -30,9 +30,10 @@ from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.images.filters import brightness, is_on_host, luminance
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians, Rasterizer, Render
-from splatam_core.tracking.base import TrackingResult, failure
+from splatam_core.tracking.base import TrackingResult
 from splatam_core.tracking.features import pose_by_features
 from splatam_core.tracking.torch_aligner import TorchAligner
+from splatam_core.tracking.verdict import verify
 
 Array = NDArray[np.float32]
 Image = Array | Tensor  # on the host; elsewhere
@@ -69,17 +70,21 @@ class AlignmentTracker:
             if self._is_good(found):
                 return found
             again = self._track(frames, view.camera, gaussians, found.T_cam_world_depth, T_cam_world_before)
-            return max(found, again, key=_rank)
+            return max(found, again, key=self._rank)
 
         found = align_from(T_cam_world)
-        if self._is_good(found) or not self._config.features:
+        if self._is_good(found) or not self._config.align.features:
             return found
         last = T_cam_world if T_cam_world_before is None else T_cam_world_before
         motion = pose_by_features(self._render(gaussians, view.camera, last), view)
-        return found if motion is None else max(found, align_from(motion @ last), key=_rank)
+        return found if motion is None else max(found, align_from(motion @ last), key=self._rank)
+
+    def _rank(self, result: TrackingResult) -> tuple[bool, float]:
+        """The larger is the better result."""
+        return not verify(result, self._config), result.inlier_fraction
 
     def _is_good(self, result: TrackingResult) -> bool:
-        return result.inlier_fraction >= self._config.again_below
+        return result.inlier_fraction >= self._config.align.again_below
 
     def _track(
         self, frames: list[_Picture], camera: PinholeCamera, gaussians: Gaussians, T_cam_world: Matrix,
@@ -93,12 +98,11 @@ class AlignmentTracker:
         readings = int((frames[0].depth > 0).sum())
         visible_fraction, inlier_fraction = fit.compared / max(1, readings), fit.agreeing / max(1, fit.compared)
         at_color, at_depth = alignment.state.light_motion @ T_cam_world, alignment.state.motion @ T_cam_world
-        reason = failure(at_color, readings, visible_fraction, inlier_fraction, self._config)
-        return TrackingResult(at_color, at_depth, visible_fraction, inlier_fraction, reason)
+        return TrackingResult(at_color, at_depth, readings, visible_fraction, inlier_fraction)
 
     def _references(self, gaussians: Gaussians, full: PinholeCamera, finest: PinholeCamera, T_cam_world: Matrix) -> list[_Picture]:
         """The map from the first guess, at the resolutions of ``_levels``."""
-        least = self._config.half_render_from
+        least = self._config.align.half_render_from
         camera = finest if 0 < least <= full.width else full
         render = self._render(gaussians, camera, T_cam_world)
         picture = _reference(camera, render, self._config.silhouette_threshold)
@@ -156,7 +160,7 @@ class AlignmentTracker:
         return _Alignment(state, found) if better else _Alignment(guess, at_guess)
 
     def _free_unknowns(self) -> list[int]:
-        return [*range(6), *[6, 7] * self._config.exposure, *[8] * self._config.lag]
+        return [*range(6), *[6, 7] * self._config.align.exposure, *[8] * self._config.align.time_offset]
 
     def _fit(self, reference: _Picture, layers: Image, state: _State, scales: tuple[float, float]) -> _Fit:
         camera, config = reference.camera, self._config
@@ -282,11 +286,6 @@ class _Alignment:
 
     state: _State
     fit: _Fit
-
-
-def _rank(result: TrackingResult) -> tuple[bool, float]:
-    """Of two, the larger is to be believed."""
-    return not result.failure, result.inlier_fraction
 
 
 def _frame(view: View) -> _Picture:

@@ -1,4 +1,4 @@
-"""What every tracker returns, and when it counts as lost."""
+"""What every tracker does and returns."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatam_core.config import TrackingConfig
 from splatam_core.images.filters import is_on_host
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians, Render
@@ -26,16 +25,16 @@ class TrackingResult:
     Attributes:
         T_cam_world: [4, 4] float64, when colour was taken.
         T_cam_world_depth: [4, 4] float64, when depth was taken; the same for trackers that take the two to be one.
+        num_readings: pixels with a depth reading; None for a tracker that looks at none.
         visible_fraction: fraction of the pixels with a depth reading that see the map at the pose.
         inlier_fraction: fraction of those that agree with the map in depth and colour.
-        failure: why the pose must not be used; empty where it may be.
     """
 
     T_cam_world: Matrix
     T_cam_world_depth: Matrix
+    num_readings: int | None
     visible_fraction: float
     inlier_fraction: float
-    failure: str
 
 
 class Tracker(Protocol):
@@ -94,30 +93,3 @@ class Candidate:
         )  # fmt: skip
         pose, cost = torch.where(better, other.pose, self.pose), torch.where(better, other.cost, self.cost)
         return Candidate(pose, render, cost, self.mean_error)
-
-
-def judge(T_cam_world: NDArray[np.float64], render: Render, view: View, config: TrackingConfig) -> TrackingResult:
-    """Hold the map, rendered at a pose, against the view: is this where the camera is?"""
-    sure = view.valid & (render.silhouette > config.silhouette_threshold)
-    depth_agrees = (render.depth() - view.depth).abs() <= config.inlier_depth * view.depth
-    color_agrees = (render.rgb - view.rgb).abs().mean(dim=0) <= config.inlier_color
-    counts = torch.stack([view.valid.sum(), sure.sum(), (sure & depth_agrees & color_agrees).sum()])
-    readings, num_visible, num_inliers = counts.tolist()
-    visible_fraction, inlier_fraction = num_visible / max(1, readings), num_inliers / max(1, num_visible)
-    reason = failure(T_cam_world, readings, visible_fraction, inlier_fraction, config)
-    return TrackingResult(T_cam_world, T_cam_world, visible_fraction, inlier_fraction, reason)
-
-
-def failure(
-    T_cam_world: NDArray[np.float64], readings: int, visible_fraction: float, inlier_fraction: float, config: TrackingConfig
-) -> str:
-    """Why a pose must not be used; empty where it may be."""
-    if not np.isfinite(T_cam_world).all():
-        return 'tracking diverged: the pose is not finite'
-    if readings == 0:
-        return 'no pixel has a usable depth reading'
-    if visible_fraction < config.min_sure_fraction:
-        return f'only {visible_fraction:.0%} of the view is mapped (at least {config.min_sure_fraction:.0%} needed)'
-    if inlier_fraction < config.min_inlier_fraction:
-        return f'only {inlier_fraction:.0%} of it agrees with the map (at least {config.min_inlier_fraction:.0%} needed)'
-    return ''

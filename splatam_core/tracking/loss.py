@@ -32,14 +32,14 @@ def tracking_loss(render: Render, view: View, config: TrackingConfig) -> Trackin
 
     Without the silhouette's mask depth counts at every reading, and colour at every pixel, map or not.
     """
-    counts = view.valid & (render.silhouette.detach() > config.silhouette_threshold) if config.use_silhouette else view.valid
-    error = ((render.depth_acc if config.blended_depth else expected_depth(render)) - view.depth).abs()
-    if config.depth_outlier_ratio > 0:
-        counts = inliers(error.detach(), counts, config.depth_outlier_ratio)
+    counts = view.valid & (render.silhouette.detach() > config.silhouette_threshold) if config.paper.use_silhouette else view.valid
+    error = ((render.depth_acc if config.paper.blended_depth else expected_depth(render)) - view.depth).abs()
+    if config.paper.depth_outlier_ratio > 0:
+        counts = inliers(error.detach(), counts, config.paper.depth_outlier_ratio)
     mask = counts.to(view.rgb.dtype)
     depth = (error * mask).sum()
     difference = (render.rgb - view.rgb).abs()
-    color = (difference * mask).sum() if config.use_silhouette or config.depth_outlier_ratio > 0 else difference.sum()
+    color = (difference * mask).sum() if config.paper.use_silhouette or config.paper.depth_outlier_ratio > 0 else difference.sum()
     return TrackingLoss(config.depth_weight * depth + config.color_weight * color, depth.detach(), counts.sum())
 
 

@@ -23,4 +23,4 @@ class NullTracker:
         self, view: View, gaussians: Gaussians, T_cam_world: Matrix, T_cam_world_before: Matrix | None = None
     ) -> TrackingResult:
         """See ``Tracker.track``."""
-        return TrackingResult(T_cam_world, T_cam_world, visible_fraction=1.0, inlier_fraction=1.0, failure='')
+        return TrackingResult(T_cam_world, T_cam_world, num_readings=None, visible_fraction=1.0, inlier_fraction=1.0)

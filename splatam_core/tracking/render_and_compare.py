@@ -14,8 +14,9 @@ from splatam_core.geometry import se3
 from splatam_core.images.filters import is_on_host
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians, Rasterizer
-from splatam_core.tracking.base import Candidate, Matrix, TrackingResult, judge
+from splatam_core.tracking.base import Candidate, Matrix, TrackingResult
 from splatam_core.tracking.loss import TrackingLoss, tracking_loss
+from splatam_core.tracking.verdict import compare
 
 
 class RenderAndCompareTracker:
@@ -35,8 +36,8 @@ class RenderAndCompareTracker:
         translation = torch.tensor(T_cam_world[:3, 3], dtype=torch.float32).to(device)
         optimizer = torch.optim.Adam(
             [
-                {'params': [rotation.requires_grad_()], 'lr': config.rotation_rate},
-                {'params': [translation.requires_grad_()], 'lr': config.translation_rate},
+                {'params': [rotation.requires_grad_()], 'lr': config.paper.rotation_rate},
+                {'params': [translation.requires_grad_()], 'lr': config.paper.translation_rate},
             ],
             fused=not is_on_host(rotation),
         )
@@ -58,11 +59,11 @@ class RenderAndCompareTracker:
             optimizer.zero_grad()
             loss.total.backward()
             optimizer.step()
-        return judge(_float64(best.pose), best.render, view, config)
+        return compare(_float64(best.pose), best.render, view, config)
 
     def _is_poor(self, loss: TrackingLoss, view: View) -> bool:
         """Whether depth is so far off that more steps are worth it; the original compares the sum over the image."""
-        limit_m = self._config.extend_above_m
+        limit_m = self._config.paper.extend_above_m
         return limit_m > 0 and loss.depth.item() > limit_m * view.depth.numel()
 
 

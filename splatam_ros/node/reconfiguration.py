@@ -1,19 +1,20 @@
-"""Parameters that change while the node runs: checked as a whole, refused with a reason, or handed on."""
+"""Parameter changes while the node runs: checked as a set, then refused with a reason or passed on."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from splatam_core.config import SlamConfig, with_values
+from splatam_core.config import SlamConfig, check_effect, with_values
 from splatam_core.errors import ConfigError, SplatamError
-from splatam_core.runs.run_folder import check_is_free
-from splatam_core.slam import check_truth
+from splatam_core.lifecycle import check_truth
+from splatam_core.runs.layout import check_is_free
 from splatam_ros.node.map_lifecycle import load_pose
 from splatam_ros.node.parameters import NODE_SETTINGS, SLAM, NodeOptions, field_name, why_fixed
 
@@ -21,25 +22,25 @@ SETTINGS = {setting.name: setting for setting in NODE_SETTINGS}
 
 
 class Reconfiguration:
-    """Takes over parameters that change at run time.
+    """Checks and applies parameter changes. A set of changes is applied as a whole or not at all.
 
     Attributes:
-        options: the node's parameters as they are now.
-        config: Slam's as they are now.
+        options: the node's current parameters.
+        config: the current SLAM configuration.
     """
 
     def __init__(
         self, node: Node, options: NodeOptions, config: SlamConfig,
         on_options: Callable[[NodeOptions], None], on_config: Callable[[SlamConfig], None],
     ) -> None:  # fmt: skip
-        """Listen for changes.
+        """Register with the node.
 
         Args:
-            node: whose parameters they are.
-            options: at the start.
-            config: at the start.
+            node: the node that has the parameters.
+            options: options at the start.
+            config: configuration at the start.
             on_options: called after the node's own parameters have changed.
-            on_config: called after SLAM's have.
+            on_config: called after the SLAM configuration has changed.
         """
         self.options = options
         self.config = config
@@ -72,9 +73,13 @@ class Reconfiguration:
             self._on_config(config)
 
     def _changed(self, changes: Sequence[Parameter]) -> tuple[NodeOptions, SlamConfig]:
-        own = {field_name(change.name): SETTINGS[change.name].check(change.value) for change in changes if change.name in SETTINGS}
+        own: dict[str, Any] = {
+            field_name(change.name): SETTINGS[change.name].check(change.value) for change in changes if change.name in SETTINGS
+        }
         slam = {change.name.removeprefix(SLAM): change.value for change in changes if change.name.startswith(SLAM)}
-        return replace(self.options, **own), with_values(self.config, slam)
+        config = with_values(self.config, slam)
+        check_effect(self.config, config)
+        return replace(self.options, **own), config
 
 
 def _check_may_change(name: str) -> None:
@@ -83,16 +88,16 @@ def _check_may_change(name: str) -> None:
 
 
 def check_save_path(options: NodeOptions) -> None:
-    """Whether a folder that is asked for at run time may be written to.
+    """Check that a ``save_path`` set at run time may be written to.
 
     Raises:
-        ConfigError: there is no ``save_root``, or the folder is not below it.
-        RunFolderError: something is in the folder.
+        ConfigError: ``save_root`` is empty, or the folder is not below it.
+        RunFolderError: the folder is not empty.
     """
     if not options.save_root:
         raise ConfigError('save_path cannot change while the node runs: save_root is empty; start the node with it set')
     root = Path(options.save_root).expanduser().resolve()
     path = options.folder
-    if path is None or root not in path.resolve().parents:  # links resolved, too
+    if path is None or root not in path.resolve().parents:  # with links resolved
         raise ConfigError(f"save_path = '{options.save_path}': expected a folder below save_root, which is {root}")
     check_is_free(path)

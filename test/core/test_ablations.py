@@ -28,7 +28,7 @@ def test_each_variant_changes_what_it_is_named_after_and_nothing_else() -> None:
     assert changed['color_only'] == {'tracking.depth_weight': 0.0, 'mapping.depth_weight': 0.0}
     assert changed['depth_only'] == {'tracking.color_weight': 0.0}
     assert changed['no_velocity'] == {'tracking.motion_model': 'last_pose'}
-    assert changed['no_silhouette'] == {'tracking.use_silhouette': False}
+    assert changed['no_silhouette'] == {'tracking.paper.use_silhouette': False}
     assert changed['silhouette_050'] == {'tracking.silhouette_threshold': 0.5}
     assert {name for values in changed.values() for name in values if name.startswith('keyframes')} == {'keyframes.selection'}
     assert all(changed.values())
@@ -43,7 +43,7 @@ def test_a_set_is_run_once_and_printed(tmp_path: Path, capfd: pytest.CaptureFixt
     command = ['ablations', *SMALL, '--only', 'full', 'no_velocity', '--out', str(tmp_path)]
     assert main(['ablations', *SMALL, '--only', 'full', '--out', str(tmp_path)]) == 0
     capfd.readouterr()
-    monkeypatch.setattr('splatam_core.evaluation.ablations.subprocess', SimpleNamespace(run=in_this_process))
+    monkeypatch.setattr('splatam_core.commands.shared.subprocess', SimpleNamespace(run=in_this_process))
     assert main(command) == 0
     first = capfd.readouterr()
     assert 'runs: 1' in first.out and '| full | 3/3 |' in first.out and '| no_velocity | 3/3 |' in first.out
@@ -56,7 +56,7 @@ def test_a_set_is_run_once_and_printed(tmp_path: Path, capfd: pytest.CaptureFixt
     unchanged = {path for path, stamp in written.items() if path.stat().st_mtime_ns == stamp}
     assert {path.parent.name for path in unchanged} == {'full'}
     assert main([*command, '--set', 'seed=1']) == 2
-    assert 'holds a run of other settings' in capfd.readouterr().err
+    assert 'holds a run with other settings' in capfd.readouterr().err
 
 
 def test_an_unknown_ablation_lists_the_known(capsys: pytest.CaptureFixture[str]) -> None:

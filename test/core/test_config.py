@@ -8,6 +8,7 @@ import pytest
 
 from splatam_core.config import SlamConfig, flat_values, load_config, preset_names, settings, to_yaml
 from splatam_core.errors import ConfigError
+from splatam_core.retired_settings import REMOVED, RENAMED, RENAMED_VALUES
 
 
 @pytest.mark.parametrize('preset', preset_names())
@@ -19,7 +20,7 @@ def test_presets_state_the_papers_numbers() -> None:
     paper, small, tum = (load_config(name) for name in ('splatam', 'splatam_s', 'tum'))
     assert (paper.tracking.iterations, paper.mapping.iterations) == (40, 60)
     assert (small.tracking.iterations, small.mapping.iterations, small.densification.scale) == (10, 15, 0.5)
-    assert (tum.tracking.iterations, tum.mapping.iterations, tum.tracking.rotation_rate) == (200, 30, 2e-3)
+    assert (tum.tracking.iterations, tum.mapping.iterations, tum.tracking.paper.rotation_rate) == (200, 30, 2e-3)
 
 
 @pytest.mark.parametrize(
@@ -37,7 +38,7 @@ def test_presets_state_the_papers_numbers() -> None:
 def test_presets_are_the_originals_configurations(preset, tracking, mapping, window, scale) -> None:
     config = load_config(preset)
     t = config.tracking
-    assert (t.iterations, t.rotation_rate, t.translation_rate) == tracking
+    assert (t.iterations, t.paper.rotation_rate, t.paper.translation_rate) == tracking
     assert (config.mapping.iterations, config.keyframes.window, config.densification.scale) == (mapping, window, scale)
     assert (config.mapping.every, config.keyframes.every, t.silhouette_threshold) == (1, 5, 0.99)
 
@@ -49,14 +50,13 @@ ORIGINALS = ('splatam', 'splatam_s', 'replica', 'replica_v2', 'tum', 'scannet', 
 def test_what_all_of_the_originals_configurations_share(preset: str) -> None:
     config = load_config(preset)
     t, d, k, m = config.tracking, config.densification, config.keyframes, config.mapping
-    assert (t.method, t.motion_model, t.use_silhouette) == ('render_and_compare', 'constant_velocity', True)
+    assert (t.method, t.motion_model, t.paper.use_silhouette) == ('render_and_compare', 'constant_velocity', True)
     assert (t.color_weight, t.depth_weight, m.color_weight, m.depth_weight) == (0.5, 1.0, 0.5, 1.0)
-    assert (t.depth_outlier_ratio, m.depth_outlier_ratio, m.ssim_weight) == (0.0, 0.0, 0.2)
+    assert (t.paper.depth_outlier_ratio, m.paper.depth_outlier_ratio, m.paper.ssim_weight) == (0.0, 0.0, 0.2)
     assert (t.silhouette_threshold, d.silhouette_threshold, d.depth_error_ratio, d.opacity) == (0.99, 0.5, 50.0, 0.5)
     assert (m.means_rate, m.rgb_rate, m.rotation_rate, m.opacity_rate, m.scale_rate) == (1e-4, 2.5e-3, 1e-3, 0.05, 1e-3)
-    assert (m.prune_from, m.prune_every, m.prune_until, m.prune_scale_from) == (0, 20, 20, 0)
-    assert (m.prune_opacity, m.prune_last_opacity or m.prune_opacity, m.prune_scale) == (0.005, 0.005, 0.1)
-    assert (m.reset_opacity_every, m.anisotropic, m.optimizer, m.hold_out) == (0, False, 'autograd', 0)
+    assert (m.paper.prune_every, m.paper.prune_until, m.prune_opacity, m.prune_scale) == (20, 20, 0.005, 0.1)
+    assert (m.anisotropic, m.optimizer, m.hold_out) == (False, 'paper', 0)
     assert (k.selection, k.overlap_samples, k.overlap_margin) == ('overlap', 1600, 20)
     assert (m.scene_radius_ratio, k.at_least) == (2.0 if preset == 'tum' else 3.0, 5 if preset == 'iphone' else 0)
     assert config.width == {'scannet': 640, 'scannetpp': 876, 'iphone': 960}.get(preset, 0)
@@ -65,9 +65,9 @@ def test_what_all_of_the_originals_configurations_share(preset: str) -> None:
 
 def test_presets_for_far_apart_photographs_track_longer_where_depth_stays_off() -> None:
     """The original's 20000 metres times pixels, at the image sizes it was meant for."""
-    assert load_config('scannetpp').tracking.extend_above_m == pytest.approx(20000 / (584 * 876), rel=0.01)
-    assert load_config('iphone').tracking.extend_above_m == pytest.approx(20000 / (720 * 960), rel=0.01)
-    assert all(load_config(name).tracking.extend_above_m == 0 for name in ('splatam', 'splatam_s', 'tum', 'scannet'))
+    assert load_config('scannetpp').tracking.paper.extend_above_m == pytest.approx(20000 / (584 * 876), rel=0.01)
+    assert load_config('iphone').tracking.paper.extend_above_m == pytest.approx(20000 / (720 * 960), rel=0.01)
+    assert all(load_config(name).tracking.paper.extend_above_m == 0 for name in ('splatam', 'splatam_s', 'tum', 'scannet'))
 
 
 def test_overrides_win_over_the_preset() -> None:
@@ -105,14 +105,65 @@ def test_wrong_overrides_say_what_is_right(override: str, message: str) -> None:
 
 
 def test_settings_that_exclude_each_other_are_refused() -> None:
-    with pytest.raises(ConfigError, match='anisotropic.*mapping.optimizer=autograd'):
+    with pytest.raises(ConfigError, match='anisotropic.*mapping.optimizer=paper'):
         load_config('realtime', ['mapping.anisotropic=true'])
-    with pytest.raises(ConfigError, match='depth_outlier_ratio.*mapping.optimizer=autograd'):
-        load_config('realtime', ['mapping.depth_outlier_ratio=10'])
-    with pytest.raises(ConfigError, match='prune_last_opacity: fused fitting has none'):
-        load_config('realtime', ['mapping.prune_last_opacity=0.1'])
-    with pytest.raises(ConfigError, match="final_passes = 3: is of fused fitting only.*'splatam refine'"):
-        load_config('quick', ['mapping.final_passes=3'])
+
+
+@pytest.mark.parametrize(
+    ('preset', 'override', 'way_out'),
+    [
+        ('realtime', 'mapping.paper.depth_outlier_ratio=10', 'mapping.optimizer = fused; set mapping.optimizer=paper'),
+        ('realtime', 'mapping.paper.ssim_weight=0.5', 'mapping.optimizer = fused; set mapping.optimizer=paper'),
+        ('realtime', 'tracking.paper.rotation_rate=0.1', 'tracking.method = align; set tracking.method=render_and_compare'),
+        ('quick', 'mapping.fused.final_passes=3', 'mapping.optimizer = paper; set mapping.optimizer=fused'),
+        ('splatam', 'tracking.align.features=false', 'tracking.method = render_and_compare; set tracking.method=align'),
+    ],
+)
+def test_settings_of_what_is_not_in_use_are_refused(preset: str, override: str, way_out: str) -> None:
+    """And accepted together with the choice that they belong to."""
+    with pytest.raises(ConfigError, match=f'^{override.partition("=")[0]} = .*: has no effect with {way_out}'):
+        load_config(preset, [override])
+    load_config(preset, [override, way_out.rpartition(' ')[2]])
+
+
+def test_settings_that_change_nothing_are_accepted_whatever_is_in_use() -> None:
+    """ROS writes down every parameter and gives them all back: unused ones, too."""
+    for preset in preset_names():
+        config = load_config(preset)
+        assert load_config(preset, flat_values(config)) == config
+        assert load_config('realtime', {**flat_values(load_config('realtime')), 'mapping.optimizer': 'paper'})
+
+
+@pytest.mark.parametrize('name', [*RENAMED, *REMOVED])
+def test_a_retired_name_says_what_to_use_instead(name: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config('quick', [f'{name}=1'])
+    message = str(caught.value)
+    assert message.startswith(f"'{name}' ") and '\n' not in message
+    assert f"is now '{RENAMED[name]}'" in message if name in RENAMED else REMOVED[name].instead in message
+
+
+def test_retired_names_lead_to_settings_that_exist() -> None:
+    known = {setting.name: setting for setting in settings()}
+    assert set(RENAMED.values()) <= set(known) and not (set(RENAMED) | set(REMOVED)) & set(known)
+    for (name, _), value in RENAMED_VALUES.items():
+        assert known[name].check(value) == value
+
+
+def test_files_of_earlier_versions_are_translated(tmp_path: Path) -> None:
+    path = tmp_path / 'config.yaml'
+    path.write_text(
+        'tracking: {method: align, lag: false, min_sure_fraction: 0.1}\ndensification: {settle: 1}\n'
+        'mapping: {mode: sync, optimizer: autograd, ssim_weight: 0.1, prune_from: 0}\nkeyframes: {before_last: false}\n'
+    )
+    config = load_config(str(path))
+    assert (config.tracking.align.time_offset, config.tracking.min_visible_fraction) == (False, 0.1)
+    assert (config.densification.bias_correction_rounds, config.mapping.paper.ssim_weight) == (1, 0.1)
+    path.write_text('mapping: {optimizer: fused, prune_every: 0}\n')
+    assert load_config(str(path)).mapping.fused.prune_fraction == 1.0
+    path.write_text('mapping: {reset_opacity_every: 100}\n')
+    with pytest.raises(ConfigError, match=r"mapping.reset_opacity_every = 100: .* was removed in 0.2.0: 'splatam refine"):
+        load_config(str(path))
 
 
 def test_unknown_preset_lists_the_known() -> None:

@@ -14,15 +14,16 @@ import torch
 from second_device import DEVICE, DeviceRasterizer, DeviceTensor, SecondDevice
 
 from splatam_core import slam, stopwatch
-from splatam_core.config import KeyframeConfig, SlamConfig, TrackingConfig, load_config
+from splatam_core.config import KeyframeConfig, PaperTrackingConfig, SlamConfig, TrackingConfig, load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
 from splatam_core.device import Backend
 from splatam_core.evaluation.images import ViewScorer
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.images.view import View
 from splatam_core.mapping import densification, mapper
-from splatam_core.mapping.keyframes import KeyframeStore, PosedView
+from splatam_core.mapping.keyframes import KeyframeStore
 from splatam_core.mapping.offline_refinement import refine_map
+from splatam_core.mapping.posed import PosedView
 from splatam_core.maps.export import centres
 from splatam_core.maps.ply import read_ply, write_ply
 from splatam_core.rasterizer import make_rasterizer
@@ -35,11 +36,11 @@ Room = Callable[..., SyntheticSequence]
 
 FEW_STEPS = {
     'splatam': (
-        'tracking.iterations=4', 'mapping.iterations=4', 'keyframes.every=2', 'tracking.depth_outlier_ratio=20',
-        'mapping.depth_outlier_ratio=20', 'mapping.prune_every=2', 'densification.scale=0.9',
-        'tracking.extend_above_m=0.001', 'tracking.silhouette_threshold=0.9',
+        'tracking.iterations=4', 'mapping.iterations=4', 'keyframes.every=2', 'tracking.paper.depth_outlier_ratio=20',
+        'mapping.paper.depth_outlier_ratio=20', 'mapping.paper.prune_every=2', 'densification.scale=0.9',
+        'tracking.paper.extend_above_m=0.001', 'tracking.silhouette_threshold=0.9',
     ),
-    'realtime': ('mapping.first_iterations=10', 'keyframes.every=2', 'mapping.prune_share=0.0'),
+    'realtime': ('mapping.first_iterations=10', 'keyframes.every=2', 'mapping.fused.prune_fraction=0.0'),
 }  # fmt: skip
 WIDTHS = {'splatam': 96, 'realtime': 160}
 WIDTH = 160
@@ -51,7 +52,7 @@ def _on_device(monkeypatch: pytest.MonkeyPatch) -> Iterator[SecondDevice]:
     with monkeypatch.context() as patch, SecondDevice() as device:
         patch.setattr(slam, 'choose_backend', lambda config: Backend(DEVICE, 'cpu'))
         patch.setattr(slam, 'make_rasterizer', lambda name, threads: DeviceRasterizer())
-        patch.setattr(stopwatch, 'finish', lambda device: None)
+        patch.setattr(stopwatch, 'synchronize', lambda device: None)
         yield device
 
 
@@ -148,7 +149,10 @@ def test_no_step_of_tracking_waits_for_the_device(room: Room, monkeypatch: pytes
         view = View.from_frame(sequence[1], slam.config.depth).to(DEVICE)
         waits = {}
         for config in (
-            *(TrackingConfig(method='render_and_compare', iterations=n, depth_outlier_ratio=20.0) for n in (1, 5)),
+            *(
+                TrackingConfig(method='render_and_compare', iterations=n, paper=PaperTrackingConfig(depth_outlier_ratio=20.0))
+                for n in (1, 5)
+            ),
             TrackingConfig(method='align', iterations=1),
         ):
             before = device.waits.total()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatam_core.config import MappingConfig, TrackingConfig
+from splatam_core.config import MappingConfig, PaperMappingConfig, PaperTrackingConfig, TrackingConfig
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.images.ssim import ssim_map
 from splatam_core.images.view import View
@@ -15,7 +15,7 @@ from splatam_core.rasterizer import Render
 from splatam_core.tracking.loss import tracking_loss
 
 CAMERA = PinholeCamera(6, 4, 5.0, 5.0, 3.0, 2.0)
-L1 = MappingConfig(ssim_weight=0.0)
+L1 = MappingConfig(paper=PaperMappingConfig(ssim_weight=0.0))
 GRAY = torch.full((4, 6, 3), 102, dtype=torch.uint8)  # 0.4
 
 
@@ -41,7 +41,7 @@ def test_tracking_loss_sums_where_the_map_is_sure_and_depth_is_read() -> None:
 def test_tracking_loss_without_the_silhouette_takes_colour_from_everywhere() -> None:
     render = _render(0.5, 2.3, torch.ones(4, 6))
     render.silhouette[:, :3] = 0.6  # not sure
-    loss = tracking_loss(render, _view(), TrackingConfig(use_silhouette=False))
+    loss = tracking_loss(render, _view(), TrackingConfig(paper=PaperTrackingConfig(use_silhouette=False)))
     assert loss.num_pixels == 3 * 6  # three rows with depth
     depth = 3 * 3 * (0.3 + 2.3 / 0.6 - 2.0)
     assert float(loss.depth) == pytest.approx(depth, rel=1e-5)
@@ -51,7 +51,10 @@ def test_tracking_loss_without_the_silhouette_takes_colour_from_everywhere() -> 
 def test_blended_depth_is_short_where_the_map_is_thin() -> None:
     """At a silhouette of 0.6 the sum of w z is 0.6 of the depth."""
     render = _render(0.4, 0.6 * 2.0, torch.full((4, 6), 0.6))
-    losses = [tracking_loss(render, _view(), TrackingConfig(silhouette_threshold=0.5, blended_depth=b)) for b in (False, True)]
+    losses = [
+        tracking_loss(render, _view(), TrackingConfig(silhouette_threshold=0.5, paper=PaperTrackingConfig(blended_depth=b)))
+        for b in (False, True)
+    ]
     assert [float(loss.depth) for loss in losses] == pytest.approx([0.0, 18 * 0.8], abs=1e-5)
 
 
@@ -60,16 +63,20 @@ def test_losses_leave_out_outliers_of_depth() -> None:
     render, view = _render(0.5, 2.1, torch.ones(4, 6)), _view()
     render.depth_acc[3, 5] = 12.0
     render.rgb[:, 3, 5] = 0.4
-    tracked = [tracking_loss(render, view, TrackingConfig(depth_outlier_ratio=ratio)) for ratio in (0.0, 10.0)]
+    tracked = [
+        tracking_loss(render, view, TrackingConfig(paper=PaperTrackingConfig(depth_outlier_ratio=ratio))) for ratio in (0.0, 10.0)
+    ]
     assert [loss.num_pixels for loss in tracked] == [18, 17]
     assert [float(loss.depth) for loss in tracked] == pytest.approx([17 * 0.1 + 10.0, 17 * 0.1], rel=1e-5)
     mapped = [
-        mapping_loss(render, view, MappingConfig(ssim_weight=0.0, color_weight=0.0, depth_outlier_ratio=ratio))
+        mapping_loss(
+            render, view, MappingConfig(color_weight=0.0, paper=PaperMappingConfig(ssim_weight=0.0, depth_outlier_ratio=ratio))
+        )
         for ratio in (0.0, 10.0)
     ]
     assert [float(loss) for loss in mapped] == pytest.approx([(17 * 0.1 + 10.0) / 18, 0.1], rel=1e-5)
     blind = View(CAMERA, GRAY, torch.zeros(4, 6))
-    assert float(tracking_loss(render, blind, TrackingConfig(depth_outlier_ratio=10.0)).total) == 0.0
+    assert float(tracking_loss(render, blind, TrackingConfig(paper=PaperTrackingConfig(depth_outlier_ratio=10.0))).total) == 0.0
 
 
 def test_mapping_loss_means_depth_over_readings_and_colour_over_all() -> None:

@@ -9,19 +9,24 @@ import numpy as np
 import pytest
 import torch
 
-from splatam_core.config import DensificationConfig, KeyframeConfig, MappingConfig, load_config
+from splatam_core.config import DensificationConfig, KeyframeConfig, MappingConfig, SlamConfig, load_config
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.images.view import View, unproject
 from splatam_core.mapping.densification import densify, new_gaussians, unexplained
 from splatam_core.mapping.gaussian_map import PARAMETERS, GaussianMap
-from splatam_core.mapping.keyframes import KeyframeStore, PosedView, draw, is_due, overlaps, select_keyframes
-from splatam_core.mapping.optimizers import FINAL_FIRST, FINAL_LAST, FINAL_MEANS, prunable, refine, refit
-from splatam_core.rasterizer import Gaussians, Moments, Rates, Render, Target, joined, make_rasterizer
+from splatam_core.mapping.keyframes import KeyframeStore, draw, overlaps, select_keyframes, views_to_fit
+from splatam_core.mapping.loss import mapping_loss
+from splatam_core.mapping.optimizers import TimeLimit, make_optimizer, prunable
+from splatam_core.mapping.optimizers.fused import FINAL_FIRST, FINAL_LAST, FINAL_MEANS
+from splatam_core.mapping.posed import PosedView
+from splatam_core.mapping.schedule import MappingSchedule
+from splatam_core.rasterizer import Gaussians, Moments, Rasterizer, Rates, Render, Target, joined, make_rasterizer
 from splatam_core.rasterizer.bounds import block_bounds
 from splatam_core.rasterizer.cpu import CpuRasterizer
 
 CAMERA = PinholeCamera(32, 24, 30.0, 30.0, 15.5, 11.5)
 EYE = torch.eye(4)
+NO_LIMIT = TimeLimit()
 RATES = Rates(means=1e-4, log_scales=1e-3, logit_opacities=0.05, rgb=2.5e-3)
 
 
@@ -31,6 +36,14 @@ def _view(depth_m: float = 2.0) -> View:
     rgb = torch.stack([0.5 + 0.4 * torch.sin(u / 3), 0.5 + 0.4 * torch.cos(v / 4), 0.5 + 0.01 * u])
     rgb8 = rgb.mul(255).round().byte().permute(1, 2, 0).contiguous()
     return View(CAMERA, rgb8, torch.full((24, 32), depth_m))
+
+
+def _refine(
+    gaussian_map: GaussianMap, window: list[PosedView], rasterizer: Rasterizer, config: SlamConfig, scene_radius: float = 1.0
+) -> None:
+    """Fits a map to a window as the mapper does."""
+    views = views_to_fit(window, config.mapping.iterations, config, np.random.default_rng(0))
+    make_optimizer(rasterizer, config.mapping).fit(gaussian_map, views, scene_radius)
 
 
 def _map(view: View) -> GaussianMap:
@@ -129,14 +142,14 @@ def test_settled_gaussians_render_at_the_depth_they_were_read_at() -> None:
     rasterizer = make_rasterizer('cpu', 1)
     bias = []
     for rounds in (0, 3):
-        fresh = _densified(GaussianMap(), view, DensificationConfig(settle=rounds))
+        fresh = _densified(GaussianMap(), view, DensificationConfig(bias_correction_rounds=rounds))
         render = rasterizer.render(fresh, CAMERA, EYE)
         bias.append(float((render.depth() - depth)[4:-4, 4:-4].mean()))
     assert bias[0] < -0.01
     assert abs(bias[1]) < 0.2 * abs(bias[0])
 
 
-@pytest.mark.parametrize('optimizer', ['autograd', 'fused'])
+@pytest.mark.parametrize('optimizer', ['paper', 'fused'])
 def test_mapping_makes_the_render_look_like_the_view(optimizer: str) -> None:
     view = _view()
     gaussian_map = _map(view)
@@ -149,7 +162,7 @@ def test_mapping_makes_the_render_look_like_the_view(optimizer: str) -> None:
     before = error(rasterizer.render(gaussian_map.gaussians, CAMERA, EYE))
     window = [PosedView(view, EYE)]
     config = load_config(overrides={'mapping.iterations': 60, 'mapping.optimizer': optimizer})
-    refine(gaussian_map, window, rasterizer, config, 1.0, np.random.default_rng(0))
+    _refine(gaussian_map, window, rasterizer, config)
     after = error(rasterizer.render(gaussian_map.gaussians, CAMERA, EYE))
     assert after < 0.5 * before
 
@@ -163,7 +176,7 @@ def test_every_other_step_fits_at_half_size() -> None:
             return super().fit(gaussians, moments, rates, target)
 
     config = load_config(overrides={'mapping.iterations': 5, 'mapping.optimizer': 'fused', 'mapping.half_size_every': 2})
-    refine(_map(_view()), [PosedView(_view(), EYE)], Watched(1), config, 1.0, np.random.default_rng(0))
+    _refine(_map(_view()), [PosedView(_view(), EYE)], Watched(1), config)
     assert sizes == [full := (32, 24, 32, 24, 32), half := (16, 12, 16, 12, 16), full, half, full]
 
 
@@ -180,15 +193,21 @@ class _Listed(CpuRasterizer):
 
 
 def _finishing(passes: int, **more: object) -> MappingConfig:
-    values = {'optimizer': 'fused', 'final_passes': passes} | more
+    values = {'optimizer': 'fused', 'fused.final_passes': passes} | more
     return load_config(overrides={f'mapping.{name}': value for name, value in values.items()}).mapping
+
+
+def _finish(
+    keyframes: list[PosedView], rasterizer: Rasterizer, config: MappingConfig, rng: np.random.Generator, limit: TimeLimit = NO_LIMIT
+) -> int:
+    return make_optimizer(rasterizer, config).finish(_map(_view()), keyframes, rng, limit)
 
 
 def test_finishing_fits_every_keyframe_as_often_with_fading_steps() -> None:
     """Each pass has all three, in an order of its own; step sizes fade evenly (by the same factor each step)."""
     keyframes = [PosedView(_view(), _at(0.1 * i)) for i in range(3)]
     rasterizer, config = _Listed(), _finishing(7)
-    assert refit(_map(_view()), keyframes, rasterizer, config, np.random.default_rng(0)) == 21
+    assert _finish(keyframes, rasterizer, config, np.random.default_rng(0)) == 21
     x = [round(-10 * float(target.T_cam_world[0, 3])) for _, target in rasterizer.asked]
     passes = [tuple(x[i : i + 3]) for i in range(0, 21, 3)]
     assert {frozenset(one) for one in passes} == {frozenset({0, 1, 2})} and len(set(passes)) > 1
@@ -209,23 +228,23 @@ def test_views_are_made_smaller_by_scale_and_width(scale: float, max_width: int,
 def test_finishing_ends_when_its_time_is_up_and_nothing_is_asked_of_it_by_default() -> None:
     keyframe, rng = PosedView(_view(), EYE), np.random.default_rng(0)
     in_time = _Listed()
-    assert refit(_map(_view()), [keyframe], in_time, _finishing(100_000_000), rng, limit_s=0.2) < 100_000_000
+    assert _finish([keyframe], in_time, _finishing(100_000_000), rng, TimeLimit(0.2)) < 100_000_000
     first, last = in_time.asked[0][0].rgb, in_time.asked[-1][0].rgb
     assert last < 0.1 * first  # it faded, from 5 to about 0.2 of the usual: a step takes a small part of the time
-    assert refit(_map(_view()), [keyframe], _Listed(), _finishing(5), rng, limit_s=0.0) == 0
+    assert _finish([keyframe], _Listed(), _finishing(5), rng, TimeLimit(0.0)) == 0
     stopped = _Listed()
-    assert refit(_map(_view()), [keyframe], stopped, _finishing(5), rng, stop=lambda: len(stopped.asked) == 3) == 3
-    assert refit(_map(_view()), [keyframe], rasterizer := _Listed(), _finishing(0), rng) == 0 and not rasterizer.asked
-    assert refit(_map(_view()), [], _Listed(), _finishing(5), rng) == 0
+    assert _finish([keyframe], stopped, _finishing(5), rng, TimeLimit(stop=lambda: len(stopped.asked) == 3)) == 3
+    assert _finish([keyframe], rasterizer := _Listed(), _finishing(0), rng) == 0 and not rasterizer.asked
+    assert _finish([], _Listed(), _finishing(5), rng) == 0
 
 
-@pytest.mark.parametrize('optimizer', ['autograd', 'fused'])
+@pytest.mark.parametrize('optimizer', ['paper', 'fused'])
 def test_mapping_prunes_on_the_way(optimizer: str) -> None:
     view = _view()
     gaussian_map = _map(view)
     gaussian_map.logit_opacities[::4] = -8.0
     config = load_config(overrides={'mapping.iterations': 3, 'mapping.optimizer': optimizer})
-    refine(gaussian_map, [PosedView(view, EYE)], make_rasterizer('cpu', 1), config, 10.0, np.random.default_rng(0))
+    _refine(gaussian_map, [PosedView(view, EYE)], make_rasterizer('cpu', 1), config, 10.0)
     assert len(gaussian_map) == 24 * 32 * 3 // 4
 
 
@@ -238,38 +257,40 @@ def test_pruning_drops_the_faint_and_the_wide() -> None:
 
 
 @pytest.mark.parametrize(
-    ('settings', 'left'),
-    [
-        ({'prune_every': 0}, 768),
-        ({'prune_from': 4}, 768),  # neither step is late enough
-        ({'prune_from': 3, 'prune_scale_from': 5}, 766),  # the two faint ones, at step 3
-        ({'prune_scale_from': 1}, 763),  # those at step 0, the three wide ones at step 3
-        ({'prune_last_opacity': 0.3, 'prune_scale_from': 5}, 762),  # at the last step the four half faint ones too
-        ({'prune_last_opacity': 0.3, 'prune_scale_from': 5, 'prune_until': 4}, 766),  # step 4 is no multiple of 3
-    ],
+    ('every', 'until', 'pruned_at'),
+    [(0, 20, []), (3, 3, [0, 3]), (3, 4, [0, 3]), (3, 2, [0]), (2, 20, [0, 2, 4]), (1, 1, [0, 1])],
 )
-def test_pruning_by_its_schedule(settings: dict[str, object], left: int) -> None:
-    """Steps 0 and 3 of four prune; nothing moves in between."""
-    view = _view()
+def test_pruning_by_its_schedule(every: int, until: int, pruned_at: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """At steps 0, n, 2n, ... of five, up to the last that may; nothing moves in between, so the first takes all five."""
+    view, sizes = _view(), []
     gaussian_map = _map(view)
     gaussian_map.logit_opacities[:2] = -8.0
-    gaussian_map.logit_opacities[2:6] = math.log(0.2 / 0.8)
     gaussian_map.log_scales[6:9] = math.log(0.11)
+    keep, step = gaussian_map.keep, gaussian_map.step
+    monkeypatch.setattr(gaussian_map, 'keep', lambda kept: (keep(kept), pruned.append(len(sizes))))
+    monkeypatch.setattr(gaussian_map, 'step', lambda: (step(), sizes.append(len(gaussian_map))))
+    pruned: list[int] = []
     still = {'means_rate': 0.0, 'rgb_rate': 0.0, 'opacity_rate': 0.0, 'scale_rate': 0.0}
-    values = {'iterations': 5, 'prune_every': 3, 'prune_until': 3} | still | settings
+    values = {'iterations': 5, 'paper.prune_every': every, 'paper.prune_until': until} | still
     config = load_config(overrides={f'mapping.{name}': value for name, value in values.items()})
-    refine(gaussian_map, [PosedView(view, EYE)], make_rasterizer('cpu', 1), config, 1.0, np.random.default_rng(0))
-    assert len(gaussian_map) == left
+    _refine(gaussian_map, [PosedView(view, EYE)], make_rasterizer('cpu', 1), config)
+    assert pruned == pruned_at
+    assert sizes == [763 if pruned_at else 768] * 5
 
 
-def test_opacities_are_reset_by_their_schedule() -> None:
-    """At steps 2 and 4 all are 1 % opaque again, and step as if it were their first: 0.05 of the logit each."""
-    opacities = []
+def test_opacities_that_are_reset_step_as_if_for_the_first_time() -> None:
+    """Set between gradient and step 2 of 2, 3 and 4: 1 % opaque, then 0.05 of the logit a step."""
+    opacities, view, rasterizer = [], _view(), make_rasterizer('cpu', 1)
     for iterations in (2, 3, 4):
-        gaussian_map = _map(_view())
-        values = {'iterations': iterations, 'reset_opacity_every': 2, 'prune_every': 0}
-        config = load_config(overrides={f'mapping.{name}': value for name, value in values.items()})
-        refine(gaussian_map, [PosedView(_view(), EYE)], make_rasterizer('cpu', 1), config, 1.0, np.random.default_rng(0))
+        gaussian_map = _map(view)
+        gaussian_map.start_optimization(RATES)
+        for step in range(iterations):
+            render = rasterizer.render(gaussian_map.gaussians, CAMERA, EYE)
+            mapping_loss(render, view, MappingConfig()).backward()
+            if step == 2:
+                gaussian_map.set_opacities(0.01)
+            gaussian_map.step()
+        gaussian_map.stop_optimization()
         opacities.append(torch.sigmoid(gaussian_map.logit_opacities))
     before, at, after = opacities
     assert before.min() > 0.3
@@ -406,8 +427,10 @@ def test_fused_pruning_waits_until_a_share_of_the_map_is_to_go() -> None:
     for faint, left in ((4, 768), (40, 728)):
         gaussian_map = _map(_view())
         gaussian_map.logit_opacities[:faint] = -9.0
-        config = load_config(overrides={'mapping.iterations': 1, 'mapping.optimizer': 'fused', 'mapping.prune_share': 0.02})
-        refine(gaussian_map, [PosedView(_view(), EYE)], make_rasterizer('cpu', 1), config, 10.0, np.random.default_rng(0))
+        config = load_config(
+            overrides={'mapping.iterations': 1, 'mapping.optimizer': 'fused', 'mapping.fused.prune_fraction': 0.02}
+        )
+        _refine(gaussian_map, [PosedView(_view(), EYE)], make_rasterizer('cpu', 1), config, 10.0)
         assert len(gaussian_map) == left
 
 
@@ -429,7 +452,7 @@ def test_bounds_follow_what_fitting_moves() -> None:
     gaussian_map = _map(_view())
     config = load_config(overrides={'mapping.iterations': 20, 'mapping.optimizer': 'fused', 'mapping.means_rate': 0.01})
     away = PosedView(_view(1.5), EYE)
-    refine(gaussian_map, [away], make_rasterizer('cpu', 2), config, 10.0, np.random.default_rng(0))
+    _refine(gaussian_map, [away], make_rasterizer('cpu', 2), config, 10.0)
     bounds = gaussian_map.gaussians.bounds
     assert bounds is not None
     assert (gaussian_map.means >= bounds[0, :3]).all() and (gaussian_map.means <= bounds[0, 3:6]).all()
@@ -482,12 +505,11 @@ def test_other_selections_of_keyframes(selection: str, expected: set[int] | None
         (KeyframeConfig(at_least=5), 3, [0, 1, 2]),
         (KeyframeConfig(at_least=5), 30, [0, 5, 10, 15, 20, 25]),
         (KeyframeConfig(at_least=5), None, [0, 5, 10]),  # live
-        (KeyframeConfig(before_last=True), 10, [0, 5, 8]),
-        (KeyframeConfig(before_last=True), None, [0, 5, 10]),
     ],
 )
 def test_which_frames_are_kept(config: KeyframeConfig, num_frames: int | None, kept: list[int]) -> None:
-    assert [i for i in range(num_frames or 12) if is_due(i, config, num_frames)] == kept
+    schedule = MappingSchedule(SlamConfig(keyframes=config), num_frames)
+    assert [i for i in range(num_frames or 12) if schedule.is_keyframe(i)] == kept
 
 
 def test_no_keyframe_is_mapped_with_the_first_frame_or_in_a_window_of_one() -> None:

@@ -167,7 +167,7 @@ def test_ten_frames_find_the_poses_of_the_cpu(room: Callable[..., SyntheticSeque
     Few pixels and steps, for the interpreter's sake, and short ones, so that a step or two find a better pose than the guess.
     """
     few = [
-        'threads=1', 'tracking.iterations=3', 'tracking.translation_rate=0.0005', 'tracking.rotation_rate=0.0001',
+        'threads=1', 'tracking.iterations=3', 'tracking.paper.translation_rate=0.0005', 'tracking.paper.rotation_rate=0.0001',
         'mapping.iterations=2', 'mapping.first_iterations=2', 'mapping.prune_scale=1.0', 'keyframes.every=3',
     ]  # fmt: skip
     sequence = room(10, 16, noise=False)
@@ -288,5 +288,5 @@ def test_the_compiler_takes_every_kernel(target: str, binary: str, tmp_path: Pat
 
 
 def test_every_kernel_that_is_launched_is_compiled_above() -> None:
-    sources = ''.join((ROOT / 'splatam_core/rasterizer' / name).read_text() for name in ('triton.py', 'triton_lists.py'))
+    sources = ''.join((ROOT / 'splatam_core/rasterizer/triton' / name).read_text() for name in ('rasterizer.py', 'lists.py'))
     assert set(re.findall(r'launch\(\s*kernels\.(\w+)', sources)) == set(LAUNCHED)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from splatam_core import _native
-from splatam_core.config import TrackingConfig, load_config
+from splatam_core.config import AlignmentConfig, TrackingConfig, load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
 from splatam_core.device import HOST
 from splatam_core.geometry import se3
@@ -18,6 +18,7 @@ from splatam_core.images.view import View
 from splatam_core.rasterizer import make_rasterizer
 from splatam_core.slam import Slam
 from splatam_core.tracking import AlignmentTracker, TorchAligner, make_tracker
+from splatam_core.tracking.verdict import verify
 
 EDGE = 0.05
 Image = np.ndarray
@@ -100,7 +101,7 @@ def test_tracker_finds_the_same_pose_by_either(
     slam = Slam(load_config('quick', ['threads=1', 'device=cpu']))
     for index in range(2):
         slam.process(sequence[index])
-    config = TrackingConfig(method='align', iterations=6, lag=lag, half_render_from=half_render_from)
+    config = TrackingConfig(method='align', iterations=6, align=AlignmentConfig(time_offset=lag, half_render_from=half_render_from))
     view = View.from_frame(sequence[2], slam.config.depth)
     truth = sequence.ground_truth().T_world_cam
     before, guess = (se3.inverse(truth[index]) @ truth[0] for index in (0, 1))
@@ -111,7 +112,7 @@ def test_tracker_finds_the_same_pose_by_either(
         monkeypatch.setattr(tracker, '_aligner', _Bridge(aligner) if isinstance(aligner, TorchAligner) else aligner)
         results.append(tracker.track(view, slam.map.gaussians, guess, before))
     native, ours = results
-    assert not native.failure and not ours.failure
+    assert not verify(native, config) and not verify(ours, config)
     assert np.abs(native.T_cam_world - ours.T_cam_world).max() < 2e-4
     assert np.abs(native.T_cam_world_depth - ours.T_cam_world_depth).max() < 2e-4
     assert ours.inlier_fraction == pytest.approx(native.inlier_fraction, abs=0.01)

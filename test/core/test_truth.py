@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from splatam_core.cli import main
-from splatam_core.config import TrackingConfig, load_config
-from splatam_core.datasets import open_sequence
+from splatam_core.config import PaperTrackingConfig, TrackingConfig, load_config
 from splatam_core.datasets.known_poses import FramesWithTruth
+from splatam_core.datasets.registry import open_sequence
 from splatam_core.errors import ConfigError, FrameError
 from splatam_core.geometry import se3
 from splatam_core.geometry.trajectory import Trajectory
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians, Rasterizer, Render, make_rasterizer
-from splatam_core.runs.run_folder import read_run
+from splatam_core.runs.record import read_run
 from splatam_core.slam import Slam
 from splatam_core.tracking import make_tracker
 from splatam_core.types import RgbdFrame, Status
@@ -111,7 +111,7 @@ def test_steps_are_doubled_once_where_depth_stays_off(extend_above_m: float, ite
     slam = Slam(load_config('quick', QUICK))
     slam.process(sequence[0])
     rasterizer = Counting()
-    config = TrackingConfig(iterations=iterations, extend_above_m=extend_above_m)
+    config = TrackingConfig(iterations=iterations, paper=PaperTrackingConfig(extend_above_m=extend_above_m))
     tracker = make_tracker(rasterizer, config)
     tracker.track(View.from_frame(sequence[0], slam.config.depth), slam.map.gaussians, np.eye(4))
     assert len(rasterizer.sizes) == renders

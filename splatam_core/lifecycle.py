@@ -1,0 +1,232 @@
+"""Everything about ``Slam`` but the algorithm: start, reset, settings, state, loading, rendering, the end."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatam_core.config import SlamConfig
+from splatam_core.device import choose_backend, pose_tensor
+from splatam_core.errors import ConfigError, FrameError, SplatamError
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.mapping.gaussian_map import GaussianMap
+from splatam_core.mapping.mapper import Mapper
+from splatam_core.mapping.optimizers.base import TimeLimit, never
+from splatam_core.rasterizer import Gaussians, make_rasterizer
+from splatam_core.state import SlamState
+from splatam_core.stopwatch import Stopwatch
+from splatam_core.tracking import TrackingResult, make_tracker
+from splatam_core.tracking.motion import MotionModel, MotionPrior
+from splatam_core.types import FrameResult, MapSnapshot, RenderedView, RgbdFrame, Status
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CurrentFrame:
+    """The frame that is being processed.
+
+    Attributes:
+        index: its number among those processed, from 0.
+        frame: its images.
+        clock: measures its stages.
+    """
+
+    index: int
+    frame: RgbdFrame
+    clock: Stopwatch
+
+    def result(
+        self, status: Status, T_world_cam: Matrix | None, slam: SlamLifecycle, *,
+        tracking: TrackingResult | None = None, is_keyframe: bool = False, reason: str = '',
+    ) -> FrameResult:  # fmt: skip
+        """Returns the result of this frame."""
+        is_first = status is Status.INITIALIZED
+        return FrameResult(
+            index=self.index,
+            stamp_ns=self.frame.stamp_ns,
+            status=status,
+            T_world_cam=T_world_cam,
+            is_keyframe=is_keyframe,
+            num_gaussians=slam.num_gaussians,
+            visible_fraction=float(is_first) if tracking is None else tracking.visible_fraction,
+            inlier_fraction=float(is_first) if tracking is None else tracking.inlier_fraction,
+            reason=reason,
+            timings=self.clock.timings(),
+        )
+
+
+class SlamLifecycle:
+    """What surrounds the algorithm. Synchronous, without threads of its own.
+
+    Attributes:
+        config: every setting.
+        backend: where SLAM is computed.
+        camera: camera of the frames; None before the first.
+    """
+
+    def __init__(
+        self, config: SlamConfig, motion_prior: MotionPrior | None = None, *,
+        true_motion: MotionPrior | None = None, num_frames: int | None = None,
+    ) -> None:  # fmt: skip
+        """Begins with an empty map.
+
+        Args:
+            config: every setting.
+            motion_prior: the camera's motion as another sensor measured it.
+            true_motion: the camera's true motion, for ``tracking.method: truth``; known for every frame.
+            num_frames: number of frames of the recording; None where that is unknown.
+
+        Raises:
+            ConfigError: the configuration asks for ground truth, a device or a rasterizer that is not there.
+        """
+        check_truth(config, true_motion)
+        self.config = config
+        self.backend = choose_backend(config)
+        self._motion_prior, self._true_motion, self._recording_length = motion_prior, true_motion, num_frames
+        self._rasterizer = make_rasterizer(self.backend.rasterizer, config.threads)
+        self._tracker = make_tracker(self._rasterizer, config.tracking, config.threads, self.backend.device)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets map, poses and camera; the next frame starts a new world."""
+        self._mapper = self._new_mapper()
+        self._motion = self._new_motion_model()
+        self.camera: PinholeCamera | None = None
+        self._num_frames = 0
+        self._last_stamp_ns: int | None = None
+
+    @property
+    def map(self) -> GaussianMap:
+        """The Gaussians, on the backend's device."""
+        return self._mapper.map
+
+    @property
+    def num_gaussians(self) -> int:
+        """Size of the map."""
+        return len(self.map)
+
+    def configure(self, config: SlamConfig) -> None:
+        """Uses other settings from the next frame on; seed, threads, device, rasterizer and motion model stay as they are.
+
+        Raises:
+            ConfigError: the configuration asks for ground truth that is not there.
+        """
+        check_truth(config, self._true_motion)
+        self.config = config
+        self._mapper.configure(config)
+        self._tracker = make_tracker(self._rasterizer, config.tracking, config.threads, self.backend.device)
+
+    def load(self, gaussians: Gaussians, T_world_cam: Matrix) -> None:
+        """Continues in a map made earlier.
+
+        Args:
+            gaussians: the map.
+            T_world_cam: [4, 4] approximate pose of the camera in it.
+
+        Raises:
+            ConfigError: the map is anisotropic and the configuration is not.
+        """
+        if gaussians.rotations is not None and not self.config.mapping.anisotropic:
+            raise ConfigError('the map has anisotropic Gaussians: set mapping.anisotropic=true')
+        self.reset()
+        self.map.append(gaussians)
+        self._motion.place(T_world_cam)
+
+    def state(self) -> SlamState:
+        """Returns everything that later frames depend on; ``restore`` continues from it bit for bit."""
+        return SlamState(
+            config=self.config,
+            camera=self.camera,
+            map=self.map.arrays(),
+            keyframes=tuple(self._mapper.keyframes),
+            motion=self._motion.state(),
+            rng=dict(self._mapper.rng.bit_generator.state),
+            scene_radius=self._mapper.scene_radius,
+            num_frames=self._num_frames,
+            last_stamp_ns=self._last_stamp_ns,
+        )
+
+    def restore(self, state: SlamState) -> None:
+        """Continues from the state of another Slam with the same configuration.
+
+        Raises:
+            ValueError: the state does not fit this configuration.
+        """
+        self.reset()
+        self._mapper.restore(state.map, state.keyframes, state.rng, state.scene_radius)
+        self._motion.restore(state.motion)
+        self.camera = state.camera
+        self._num_frames, self._last_stamp_ns = state.num_frames, state.last_stamp_ns
+
+    def rest(self) -> None:
+        """Assumes that the camera is at its last pose, at rest; the next frame may have any stamp."""
+        self._motion.place(self._motion.last_pose)
+        self._last_stamp_ns = None
+
+    def render(self, T_world_cam: Matrix) -> RenderedView:
+        """Renders the map from a pose [4, 4], through the camera of the frames.
+
+        Raises:
+            SplatamError: no frame has been processed yet.
+        """
+        if self.camera is None:
+            raise SplatamError('nothing can be rendered before the first frame: the camera is not known')
+        T_cam_world = pose_tensor(se3.inverse(T_world_cam), self.backend.device)
+        with torch.no_grad():
+            return self._rasterizer.render(self.map.gaussians.detached(), self.camera, T_cam_world).images()
+
+    def finish(self, limit_s: float = math.inf, stop: Callable[[], bool] = never) -> int:
+        """Fits the map to all keyframes once more, after the last frame (``mapping.fused.final_passes``).
+
+        Args:
+            limit_s: longest time, seconds.
+            stop: asked before each step; no further step is taken once it returns True.
+
+        Returns:
+            The number of steps taken.
+        """
+        return self._mapper.finish(TimeLimit(limit_s, stop))
+
+    def snapshot(self) -> MapSnapshot:
+        """Returns a copy of the map."""
+        return self.map.snapshot()
+
+    def _admit(self, frame: RgbdFrame) -> CurrentFrame:
+        """Checks a frame, numbers it and starts its clock."""
+        if self.camera is not None and frame.camera != self.camera:
+            raise FrameError(f'the camera changed from {self.camera} to {frame.camera}; reset to start a new map')
+        if self._last_stamp_ns is not None and frame.stamp_ns <= self._last_stamp_ns:
+            raise FrameError(
+                f'frame stamp {frame.stamp_ns} ns is not after the last one, {self._last_stamp_ns} ns; reset to go back in time'
+            )
+        self.camera = frame.camera
+        index, self._num_frames, self._last_stamp_ns = self._num_frames, self._num_frames + 1, frame.stamp_ns
+        return CurrentFrame(index, frame, Stopwatch(self.backend.device))
+
+    def _new_mapper(self) -> Mapper:
+        return Mapper(self.config, self._rasterizer, self.backend.device, self._recording_length)
+
+    def _new_motion_model(self) -> MotionModel:
+        if self.config.tracking.method == 'truth':
+            return MotionModel(constant_velocity=False, prior=self._true_motion)
+        return MotionModel(self.config.tracking.motion_model == 'constant_velocity', self._motion_prior)
+
+
+def check_truth(config: SlamConfig, true_motion: MotionPrior | None) -> None:
+    """Checks that ground truth is there where the configuration asks for it.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if config.tracking.method == 'truth' and true_motion is None:
+        raise ConfigError(
+            "tracking.method = truth: there is no ground truth here; only 'splatam run' on a recording that has it can use it. "
+            'Choose render_and_compare or align'
+        )

@@ -1,0 +1,96 @@
+"""What every optimizer of the map does, and what they share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatam_core.config import MappingConfig
+from splatam_core.images.filters import is_on_host
+from splatam_core.mapping.gaussian_map import GaussianMap
+from splatam_core.mapping.posed import PosedView
+from splatam_core.rasterizer import Rates
+
+
+def never() -> bool:
+    """Never stops."""
+    return False
+
+
+@dataclass(frozen=True, slots=True)
+class TimeLimit:
+    """When fitting after the last frame has to end.
+
+    Attributes:
+        seconds: time after which the step sizes have faded, however many steps that were.
+        stop: asked before each step; no further step is taken once it returns True.
+    """
+
+    seconds: float = math.inf
+    stop: Callable[[], bool] = never
+
+
+class MapOptimizer(Protocol):
+    """A way to fit the Gaussians to views whose poses are known (paper, section 3.4)."""
+
+    def fit(self, gaussian_map: GaussianMap, views: Iterable[PosedView], scene_radius: float) -> None:
+        """Takes one step for each view, and prunes.
+
+        Args:
+            gaussian_map: changed in place.
+            views: the view of each step, on the map's device.
+            scene_radius: metres; Gaussians are too wide relative to it.
+        """
+        ...
+
+    def finish(self, gaussian_map: GaussianMap, keyframes: Sequence[PosedView], rng: np.random.Generator, limit: TimeLimit) -> int:
+        """Fits the map to all keyframes once more, after the last frame.
+
+        Args:
+            gaussian_map: changed in place.
+            keyframes: the views to fit.
+            rng: draws the order of each pass.
+            limit: when to end.
+
+        Returns:
+            The number of steps taken.
+        """
+        ...
+
+
+def rates(config: MappingConfig) -> Rates:
+    """Returns Adam's step sizes."""
+    return Rates(
+        means=config.means_rate,
+        log_scales=config.scale_rate,
+        logit_opacities=config.opacity_rate,
+        rgb=config.rgb_rate,
+        rotations=config.rotation_rate,
+    )
+
+
+def prunable(gaussian_map: GaussianMap, min_opacity: float, max_scale_m: float) -> Tensor:
+    """Returns [N] which Gaussians are too faint to matter or too wide to be surface."""
+    logits, widest = gaussian_map.logit_opacities.detach(), _widest(gaussian_map.log_scales.detach())
+    faintest, limit = _logit(min_opacity), _log(max_scale_m)
+    if is_on_host(logits):  # numpy takes a fifth of torch's time, and every frame looks at the whole map
+        return torch.from_numpy((logits.numpy() < faintest) | (widest.numpy() > limit))
+    return (logits < faintest) | (widest > limit)
+
+
+def _widest(log_scales: Tensor) -> Tensor:
+    return log_scales[:, 0] if log_scales.shape[1] == 1 else log_scales.amax(dim=1)  # amax would copy a single column
+
+
+def _logit(p: float) -> float:
+    return _log(p) - _log(1 - p)
+
+
+def _log(x: float) -> float:
+    return math.log(x) if x > 0 else -math.inf

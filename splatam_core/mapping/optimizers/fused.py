@@ -1,0 +1,67 @@
+"""The fused optimizer: render, compare and step in one call of the rasterizer (``Rasterizer.fit``)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import torch
+
+from splatam_core.config import MappingConfig
+from splatam_core.mapping.gaussian_map import GaussianMap
+from splatam_core.mapping.optimizers.base import TimeLimit, prunable, rates
+from splatam_core.mapping.posed import PosedView
+from splatam_core.rasterizer import Rasterizer, Rates, Target
+
+FINAL_FIRST, FINAL_LAST = 5.0, 0.2
+"""Step sizes at the beginning and at the end of ``finish``, relative to those of ``fit``."""
+
+FINAL_MEANS, FINAL_SCALES = 0.3, 3.0
+"""Additional factors of the centres and the log scales in ``finish``."""
+
+
+class FusedOptimizer:
+    """Huber loss without SSIM; moments live as long as their Gaussians; only visible Gaussians move."""
+
+    def __init__(self, rasterizer: Rasterizer, config: MappingConfig) -> None:
+        self._rasterizer, self._config = rasterizer, config
+
+    def fit(self, gaussian_map: GaussianMap, views: Iterable[PosedView], scene_radius: float) -> None:
+        """See ``MapOptimizer.fit``."""
+        for posed in views:
+            self._step(gaussian_map, posed, rates(self._config))
+        chosen = prunable(gaussian_map, self._config.prune_opacity, self._config.prune_scale * scene_radius)
+        if torch.count_nonzero(chosen) > self._config.fused.prune_fraction * len(gaussian_map):
+            gaussian_map.keep(~chosen)
+
+    def finish(self, gaussian_map: GaussianMap, keyframes: Sequence[PosedView], rng: np.random.Generator, limit: TimeLimit) -> int:
+        """See ``MapOptimizer.finish``. Decreasing step sizes bring back what few steps a frame had forgotten."""
+        num_steps, began_s = self._config.fused.final_passes * len(keyframes), time.monotonic()
+        for step in range(num_steps):
+            if step % len(keyframes) == 0:
+                order = rng.permutation(len(keyframes))
+            done, time_used = step / num_steps, (time.monotonic() - began_s) / max(limit.seconds, 1e-9)
+            if time_used > (step + 1) / num_steps:  # else wall time changes nothing, so that runs repeat bit for bit
+                done = time_used
+            if done >= 1 or limit.stop():
+                return step
+            self._step(gaussian_map, keyframes[order[step % len(keyframes)]], _final_rates(self._config, done))
+        return num_steps
+
+    def _step(self, gaussian_map: GaussianMap, posed: PosedView, rates: Rates) -> None:
+        view, config = posed.view, self._config
+        target = Target(view.camera, view.rgb8, view.depth, posed.T_cam_world, config.color_weight, config.depth_weight)
+        self._rasterizer.fit(gaussian_map.gaussians, gaussian_map.moments, rates, target)
+
+
+def _final_rates(config: MappingConfig, done: float) -> Rates:
+    fade = FINAL_FIRST * (FINAL_LAST / FINAL_FIRST) ** done
+    usual = rates(config)
+    return Rates(
+        means=FINAL_MEANS * fade * usual.means,
+        log_scales=FINAL_SCALES * fade * usual.log_scales,
+        logit_opacities=fade * usual.logit_opacities,
+        rgb=fade * usual.rgb,
+        rotations=fade * usual.rotations,
+    )

@@ -1,0 +1,120 @@
+"""What a setting is: a typed dataclass field with help text, unit and bounds beside its default."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any, TypeVar, get_type_hints
+
+from splatam_core.errors import ConfigError
+
+Value = bool | int | float | str
+Section = TypeVar('Section')
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One leaf of the configuration.
+
+    Attributes:
+        name: dotted path, for example ``tracking.iterations``.
+        type: bool, int, float or str.
+        default: value where neither preset nor user sets another.
+        help: what it does, and when to change it.
+        unit: of the value; empty where it has none.
+        minimum: smallest allowed number, or None.
+        maximum: largest allowed number, or None.
+        choices: the allowed strings; empty where any string is allowed.
+    """
+
+    name: str
+    type: type
+    default: Value
+    help: str
+    unit: str
+    minimum: float | None
+    maximum: float | None
+    choices: tuple[str, ...]
+
+    def check(self, value: object) -> Value:
+        """Returns the value in this setting's type.
+
+        Raises:
+            ConfigError: the value has the wrong type or is outside what is allowed.
+        """
+        if self.type is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if type(value) is not self.type or (self.choices and value not in self.choices):
+            raise ConfigError(f'{self.name} = {value!r}: expected {self._allowed()}')
+        too_low = self.minimum is not None and not value >= self.minimum
+        too_high = self.maximum is not None and not value <= self.maximum
+        if too_low or too_high:
+            raise ConfigError(f'{self.name} = {value}: expected {self._allowed()}')
+        return value
+
+    def _allowed(self) -> str:
+        if self.choices:
+            return 'one of ' + ', '.join(self.choices)
+        kind = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'a text'}[self.type]
+        bounds = [f'at least {self.minimum:g}'] if self.minimum is not None else []
+        bounds += [f'at most {self.maximum:g}'] if self.maximum is not None else []
+        return ' '.join([kind, ' and '.join(bounds), f'({self.unit})' if self.unit else '']).strip()
+
+
+def setting(
+    default: Value,
+    help: str,
+    *,
+    unit: str = '',
+    minimum: float | None = None,
+    maximum: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """Returns a dataclass field that is a setting."""
+    metadata = {'help': help, 'unit': unit, 'minimum': minimum, 'maximum': maximum, 'choices': choices}
+    return field(default=default, metadata=metadata)
+
+
+def settings_of(section: type, prefix: str = '') -> Iterator[Setting]:
+    """Yields every setting of a section and of the sections in it, in order."""
+    hints = get_type_hints(section)
+    for entry in fields(section):
+        if is_dataclass(hints[entry.name]):
+            yield from settings_of(hints[entry.name], f'{prefix}{entry.name}.')
+        else:
+            yield Setting(f'{prefix}{entry.name}', hints[entry.name], entry.default, **entry.metadata)
+
+
+def leaf(section: object, name: str) -> Value:
+    """Returns the value of a setting by its dotted name."""
+    value: Any = section
+    for part in name.split('.'):
+        value = getattr(value, part)
+    return value
+
+
+def with_leaf(section: Section, path: list[str], value: Value) -> Section:
+    """Returns the section with one setting, at a path of names, set to a value."""
+    head, *rest = path
+    changed = with_leaf(getattr(section, head), rest, value) if rest else value
+    return replace(section, **{head: changed})  # type: ignore[type-var]  # every section is a dataclass
+
+
+def flatten(tree: Mapping[str, Any], prefix: str = '') -> dict[str, object]:
+    """Returns nested mappings as one: dotted names to values."""
+    flat: dict[str, object] = {}
+    for key, value in tree.items():
+        flat |= flatten(value, f'{prefix}{key}.') if isinstance(value, Mapping) else {f'{prefix}{key}': value}
+    return flat
+
+
+def unflatten(values: Mapping[str, Value]) -> dict[str, Any]:
+    """Returns dotted names as nested mappings."""
+    tree: dict[str, Any] = {}
+    for name, value in values.items():
+        *sections, last = name.split('.')
+        branch = tree
+        for section in sections:
+            branch = branch.setdefault(section, {})
+        branch[last] = value
+    return tree
