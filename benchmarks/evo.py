@@ -22,7 +22,7 @@ from header import print_header
 from splatam_core.commands.shared import open_source
 from splatam_core.evaluation.score import score_trajectory
 from splatam_core.geometry.trajectory import Trajectory, interpolate_poses, pose_line
-from splatam_core.runs.run_folder import read_run
+from splatam_core.runs.record import read_run
 
 COLUMNS = '| | ours | evo | difference |'
 

@@ -1,4 +1,4 @@
-"""Files that are never half there."""
+"""Files and folders that appear complete or not at all."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from pathlib import Path
 
 @contextmanager
 def replaced(path: Path) -> Iterator[Path]:
-    """A path beside the given one to write to; it takes its place once the block is through without an error.
+    """Yields a temporary path to write to; the file there replaces the given one when the block ends without an error.
 
-    Readers see the old file or the new one, complete, whenever they look and whatever interrupts the writer.
+    Readers see the complete old file or the complete new one at any time, whatever interrupts the writer.
     """
     temporary = path.with_name(f'.{path.name}.{os.getpid()}')
     try:
         yield temporary
         with temporary.open('rb') as file:
-            os.fsync(file.fileno())  # else a power cut may leave the new name with nothing behind it
+            os.fsync(file.fileno())  # otherwise a power cut may leave an empty file under the new name
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -27,10 +27,10 @@ def replaced(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """A folder beside the given path to write into; it gets that path once the block is through without an error.
+    """Yields a temporary folder to write into; it moves to the given path when the block ends without an error.
 
     Raises:
-        OSError: it cannot be made, or something but an empty folder is at the path by then.
+        OSError: it cannot be made, or something other than an empty folder is at the path in the end.
     """
     temporary = path.with_name(f'.{path.name}.{os.getpid()}')
     try:
@@ -42,12 +42,17 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 
 def is_unfinished(name: str, replaceable: Collection[str]) -> bool:
-    """Whether a file's name is one that ``replaced`` left when its process was killed."""
+    """Returns True if ``replaced`` left a file of this name when its process was killed.
+
+    Args:
+        name: of the file.
+        replaceable: names that ``replaced`` may have been given.
+    """
     stem, _, process = name.removeprefix('.').rpartition('.')
     return name.startswith('.') and process.isdecimal() and stem in replaceable
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a text file in one step, in place of the one that is there."""
+    """Writes a text file in one step; it replaces the file at the path."""
     with replaced(path) as temporary:
         temporary.write_text(text, encoding='utf-8')

@@ -1,1 +1,1 @@
-"""The commands of ``splatam``, one file each. Whatever takes time to import is imported when a command runs."""
+"""The commands of ``splatam``, one file each. Slow imports (torch, OpenCV, matplotlib) happen when a command runs."""

@@ -1,36 +1,50 @@
-"""``splatam ablations``: what each part of SplaTAM is worth, as the paper's tables ask."""
+"""``splatam ablations``: runs the paper's ablations over a recording and prints their table."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatam_core.commands.shared import Command, add_source_arguments, at_width, open_source, say, source_of, source_words
+from splatam_core.commands.shared import (
+    Command,
+    add_preset_arguments,
+    add_source_arguments,
+    at_width,
+    open_source,
+    run_in_own_process,
+    say,
+    source_of,
+    source_words,
+)
 
 if TYPE_CHECKING:
-    from splatam_core.runs.run_folder import Source
+    from splatam_core.runs.record import Source
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_source_arguments(parser)
-    parser.add_argument('--preset', default='splatam', help='what all start from (default: %(default)s)')
-    parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE', help='a setting of all of them')
-    parser.add_argument('--only', nargs='+', metavar='NAME', help='some of them (default: all; see config/ablations)')
-    parser.add_argument('--out', type=Path, required=True, metavar='DIR', help='folder of the runs; finished ones are kept')
+    add_preset_arguments(parser)
+    parser.add_argument('--only', nargs='+', metavar='NAME', help='run only these (default: all in config/ablations)')
+    parser.add_argument('--out', type=Path, required=True, metavar='DIR', help='folder of the runs; finished runs are kept')
 
 
 def ablations(args: argparse.Namespace) -> int:
-    """Run the paper's ablations over a recording, one after another, and print their table."""
-    from splatam_core.evaluation.ablations import provenance, run, table, variant_names, variants
+    """Runs the paper's ablations one after another, and prints their table. Finished runs are not repeated."""
+    from splatam_core.evaluation.ablations import is_finished, provenance, table, variant_names, variants
 
     chosen = variants(args.only or variant_names(), args.preset, args.set)
     source = at_width(source_of(args), chosen[0].config)
-    open_source(source)
+    open_source(source)  # raises before the first run
     folders = {variant.name: args.out / variant.name for variant in chosen}
     for number, variant in enumerate(chosen, 1):
+        folder = folders[variant.name]
         say(f'{variant.name} ({number} of {len(chosen)})')
-        if not run(variant, source_words(source), source, folders[variant.name]):
+        if is_finished(variant, source, folder):
+            continue
+        words = ['run', *source_words(source), *variant.words(), '--out', folder, '--overwrite']
+        if run_in_own_process(words, stdout=sys.stderr) != 0:
             say(f'{variant.name} failed; see above')
     title = f'{Path(source.path).name}{_window_text(source)}, preset `{args.preset}`'
     print(f'{title}; {provenance(folders.values())}; runs: 1.\n\n{table(folders)}')

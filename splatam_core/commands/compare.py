@@ -1,4 +1,4 @@
-"""``splatam compare``: runs side by side, as a table and a picture."""
+"""``splatam compare``: compares runs in a table and a picture."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from splatam_core.errors import RunFolderError
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('dirs', type=Path, nargs='+', metavar='DIR', help='folders of runs')
+    parser.add_argument('dirs', type=Path, nargs='+', metavar='DIR', help='run folders')
     add_plot_argument(parser)
 
 
 def add_plot_argument(parser: argparse.ArgumentParser) -> None:
-    """Where the picture goes."""
+    """Adds --plot."""
     parser.add_argument(
         '--plot', type=Path, default=Path('compare.png'), metavar='FILE',
         help='picture to draw, .png, .svg or .pdf (default: %(default)s)',
@@ -24,20 +24,20 @@ def add_plot_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def compare(args: argparse.Namespace) -> int:
-    """Print a table of runs and draw them."""
+    """Prints a table of runs and draws them."""
     compare_runs(args.dirs, args.plot)
     return 0
 
 
 def compare_runs(folders: Sequence[Path], plot: Path) -> None:
-    """Print a table of runs and draw them.
+    """Prints a table of runs and draws them.
 
     Raises:
-        RunFolderError: one of them is no run, or the picture cannot be written.
+        RunFolderError: one of the folders holds no run, or the picture cannot be written.
     """
     from splatam_core.atomic_io import replaced
     from splatam_core.evaluation.report.comparison import comparison_table, draw_comparison
-    from splatam_core.runs.run_folder import read_run
+    from splatam_core.runs.record import read_run
 
     kind = plot.suffix.removeprefix('.').lower()
     if kind not in ('png', 'svg', 'pdf'):
@@ -53,4 +53,4 @@ def compare_runs(folders: Sequence[Path], plot: Path) -> None:
     print(f'\npicture: {plot}')
 
 
-COMMAND = Command('compare', 'print a table of runs and draw them side by side', _add_arguments, compare)
+COMMAND = Command('compare', 'compare runs in a table and a picture', _add_arguments, compare)

@@ -1,4 +1,4 @@
-"""``splatam evaluate``: score a run and draw its report."""
+"""``splatam evaluate``: scores a run and writes its report."""
 
 from __future__ import annotations
 
@@ -24,30 +24,30 @@ if TYPE_CHECKING:
     from splatam_core.evaluation.score import NovelViews
     from splatam_core.geometry.trajectory import Trajectory
     from splatam_core.runs.metrics import Metrics
-    from splatam_core.runs.run_folder import RunRecord
+    from splatam_core.runs.record import RunRecord
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_run_argument(parser)
     parser.add_argument(
-        '--truth', metavar='FILE|BAG|DATASET', help="TUM trajectory, bag or dataset (default: the run's own source)"
+        '--truth', metavar='FILE|BAG|DATASET', help="ground truth: TUM trajectory, bag or dataset (default: the run's own source)"
     )
     parser.add_argument('--every', type=positive, default=1, metavar='N', help='score the images of every n-th frame only')
     parser.add_argument(
         '--novel-views', nargs='?', choices=('trajectory', 'first'), const='trajectory', metavar='ALIGNMENT',
-        help="also score the test split of the run's dataset at its true poses, brought into the map by the alignment "
-        "of the whole 'trajectory' (default) or by its 'first' pose, as the original does",
+        help="also score the test split of the run's dataset at its true poses; ALIGNMENT to the map is by the whole "
+        "'trajectory' (default) or by its 'first' pose, as the original does",
     )  # fmt: skip
 
 
 def evaluate(args: argparse.Namespace) -> int:
-    """Score a run and draw its report."""
-    from splatam_core.runs.run_folder import MAP
+    """Scores a run and writes its report."""
+    from splatam_core.runs.layout import MAP
 
     run = open_run(args.dir, args.device)
     truth, sequence = _truth_and_frames(run, args.truth)
     if sequence is not None and not (run.path / MAP).is_file():
-        say(f'{run.path} has no {MAP}, the run ended before it was saved: trajectory only')
+        say(f'{run.path} has no {MAP} because the run ended before saving it: only the trajectory is scored')
         sequence = None
     novel = _score_novel_views(run, args.novel_views) if args.novel_views else None
     print_summary(score(run, truth, sequence, args.every, novel), args.dir)
@@ -57,13 +57,21 @@ def evaluate(args: argparse.Namespace) -> int:
 def score(
     run: RunRecord, truth: Trajectory | None, sequence: Sequence | None, every: int, novel: NovelViews | None = None
 ) -> Metrics:
-    """Score, then write ``metrics.json``, ``scores.csv`` and the reports; an error leaves them as they are."""
+    """Scores a run, then writes ``metrics.json``, ``scores.csv`` and the reports. After an error these files are unchanged.
+
+    Args:
+        run: to be scored.
+        truth: ground-truth poses; None = no trajectory error.
+        sequence: the frames; None = no image scores.
+        every: score the images of every n-th frame.
+        novel: scored test views, if any.
+    """
     from splatam_core.atomic_io import replace_text
     from splatam_core.evaluation.report.frame_table import write_frame_table
     from splatam_core.evaluation.report.html import write_html
     from splatam_core.evaluation.report.picture import write_report
     from splatam_core.evaluation.score import combine, score_images, score_trajectory
-    from splatam_core.runs.run_folder import METRICS, PAGE, REPORT, SCORES
+    from splatam_core.runs.layout import METRICS, PAGE, REPORT, SCORES
 
     against_truth = None if truth is None else score_trajectory(run, truth)
     against_images = None if sequence is None else score_images(run, sequence, every, progress('scoring'))
@@ -76,7 +84,7 @@ def score(
 
 
 def score_own_run(run: RunRecord, sequence: Sequence, every: int = 1) -> Metrics:
-    """Score a run just done; where too little was tracked to compare with the truth, the images only."""
+    """Scores a run against its own source; the images only where too few frames are tracked for a trajectory error."""
     try:
         return score(run, sequence.ground_truth(), sequence, every)
     except RunFolderError as error:
@@ -85,9 +93,9 @@ def score_own_run(run: RunRecord, sequence: Sequence, every: int = 1) -> Metrics
 
 
 def _truth_and_frames(run: RunRecord, given: str | None) -> tuple[Trajectory | None, Sequence | None]:
-    """What to score against. The run's own source shows the frames where it can be opened."""
+    """Returns the ground truth and the frames to score against. The frames are those of the run's own source if possible."""
     from splatam_core.geometry.trajectory import read_trajectory
-    from splatam_core.runs.run_folder import Source
+    from splatam_core.runs.record import Source
 
     if given is None:
         if run.description.source is None:
@@ -100,7 +108,7 @@ def _truth_and_frames(run: RunRecord, given: str | None) -> tuple[Trajectory | N
     other = open_source(Source(given, width=run.camera.width if run.camera else None))
     truth = other.ground_truth()
     if truth is None:
-        say(f'{given} has no true poses: images only')
+        say(f'{given} has no ground-truth poses: only the images are scored')
     return truth, other if own is None else own
 
 
@@ -127,12 +135,12 @@ def _score_novel_views(run: RunRecord, alignment: str) -> NovelViews:
     except DatasetError as error:
         raise RunFolderError(f'--novel-views needs a dataset with a test split: {error}') from None
     if truth is None:
-        raise RunFolderError(f'{source.path} has no true poses: novel views are rendered at those')
+        raise RunFolderError(f'{source.path} has no ground-truth poses, which novel views need')
     return score_novel_views(run, truth, test, alignment, progress('novel views', 'view'))
 
 
 def print_summary(metrics: Metrics, folder: Path) -> None:
-    """The headline numbers, one a line."""
+    """Prints the main numbers, one per line."""
     m, notes = metrics, metrics.notes
     rows = [
         ('tracked', f'{m.tracked} of {m.frames} frames'),
@@ -148,10 +156,12 @@ def print_summary(metrics: Metrics, folder: Path) -> None:
     ]
     if m.heldout_frames:
         scores = f'{_text(m.heldout.psnr_db, 1, ".2f", "dB")}, depth L1 {_text(m.heldout.depth_l1_m, 100, ".2f", "cm")}'
-        rows.append(('held out', f'PSNR {scores}; {m.heldout_frames} frames kept out of the map'))
+        rows.append(('held out', f'PSNR {scores}; {m.heldout_frames} frames held out of the map'))
     if m.novel_alignment:
         scores = f'{_text(m.novel.psnr_db, 1, ".2f", "dB")}, depth L1 {_text(m.novel.depth_l1_m, 100, ".2f", "cm")}'
-        rows.append(('novel', f'PSNR {scores}; {m.novel_frames} views without holes, {m.novel_holes_frames} with apart'))
+        rows.append(
+            ('novel', f'PSNR {scores}; {m.novel_frames} views without holes; {m.novel_holes_frames} with holes are scored apart')
+        )
     rows += [('Gaussians', _text(m.num_gaussians, 1, ',', '')), ('results', str(folder))]
     for name, value in rows:
         print(f'{name:<10} {value}'.rstrip())
@@ -160,10 +170,10 @@ def print_summary(metrics: Metrics, folder: Path) -> None:
 def _relative(metrics: Metrics) -> str:
     if metrics.rpe_trans_frame_m is None:
         return 'not known'
-    per_frame = f'{metrics.rpe_trans_frame_m * 1e3:.2f} mm, {metrics.rpe_rot_frame_deg:.3f} deg a frame'
+    per_frame = f'{metrics.rpe_trans_frame_m * 1e3:.2f} mm, {metrics.rpe_rot_frame_deg:.3f} deg per frame'
     if metrics.rpe_trans_1s_m is None:
         return per_frame
-    return f'{per_frame}; {metrics.rpe_trans_1s_m * 1e3:.1f} mm, {metrics.rpe_rot_1s_deg:.2f} deg a second'
+    return f'{per_frame}; {metrics.rpe_trans_1s_m * 1e3:.1f} mm, {metrics.rpe_rot_1s_deg:.2f} deg per second'
 
 
 def _text(value: float | None, factor: float, digits: str, unit: str, why_not: str | None = None) -> str:
@@ -172,4 +182,4 @@ def _text(value: float | None, factor: float, digits: str, unit: str, why_not: s
     return f'{value * factor:{digits}} {unit}'.rstrip()
 
 
-COMMAND = Command('evaluate', 'score a run and draw its report', _add_arguments, evaluate)
+COMMAND = Command('evaluate', 'score a run and write its report', _add_arguments, evaluate)

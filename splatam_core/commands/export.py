@@ -1,4 +1,4 @@
-"""``splatam export``: a run's map as a file for other programs."""
+"""``splatam export``: writes a run's map for other programs."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ if TYPE_CHECKING:
 
     from splatam_core.maps.export import Surface
     from splatam_core.rasterizer import Gaussians
-    from splatam_core.runs.run_folder import RunRecord
+    from splatam_core.runs.record import RunRecord
 
 FORMS = ('gaussians', 'points', 'mesh', 'splatam')
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_run_argument(parser)
-    parser.add_argument('file', type=Path, metavar='FILE', help='the file to write: .ply, or .npz of --as splatam')
+    parser.add_argument('file', type=Path, metavar='FILE', help='file to write: .ply, or .npz with --as splatam')
     parser.add_argument(
         '--as', dest='form', choices=FORMS, default='gaussians',
-        help="'gaussians' for splat viewers (default), 'points' for coloured centres, 'mesh' for the surface fused from "
-        "rendered depth (pip install 'splatam_ros[mesh]'), 'splatam' for the original's params.npz",
+        help="'gaussians': for splat viewers (default); 'points': coloured centres; 'mesh': surface fused from rendered depth "
+        "(needs pip install 'splatam_ros[mesh]'); 'splatam': params.npz for the original's programs",
     )  # fmt: skip
     parser.add_argument('--overwrite', action='store_true', help='replace FILE')
     parser.add_argument(
@@ -34,19 +34,19 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_number,
         default=0.5,
         metavar='O',
-        help='of points: leave out fainter ones (default: %(default)s)',
+        help='points: skip Gaussians of lower opacity (default: %(default)s)',
     )
-    parser.add_argument('--voxel', type=_number, default=0.01, metavar='M', help='of a mesh: metres (default: %(default)s)')
+    parser.add_argument(
+        '--voxel', type=_number, default=0.01, metavar='M', help='mesh: size of a voxel in metres (default: %(default)s)'
+    )
     parser.add_argument(
         '--max-depth',
         type=_number,
         default=6.0,
         metavar='M',
-        help='of a mesh: leave out what is farther (default: %(default)s)',
+        help='mesh: ignore depth beyond M metres (default: %(default)s)',
     )
-    parser.add_argument(
-        '--every', type=positive, default=5, metavar='N', help='of a mesh: fuse every n-th frame (default: %(default)s)'
-    )
+    parser.add_argument('--every', type=positive, default=5, metavar='N', help='mesh: fuse every n-th frame (default: %(default)s)')
 
 
 def _number(text: str) -> float:
@@ -57,7 +57,7 @@ def _number(text: str) -> float:
 
 
 def export(args: argparse.Namespace) -> int:
-    """Write a run's map as a file for other programs."""
+    """Writes a run's map for other programs."""
     from splatam_core.maps.export import centres
     from splatam_core.maps.ply import write_ply, write_surface
 
@@ -92,8 +92,8 @@ def _mesh(args: argparse.Namespace, run: RunRecord, gaussians: Gaussians) -> Sur
 
     rasterizer, device = rasterizer_for(run.config)
     return fused_mesh(
-        gaussians.to(device), rasterizer, run.camera_or_error(),
-        run.trajectory.T_world_cam[:: args.every], args.voxel, args.max_depth, progress('fusing', 'view'),
+        gaussians.to(device), rasterizer, run.camera_or_error(), run.trajectory.T_world_cam[:: args.every],
+        voxel_m=args.voxel, max_depth_m=args.max_depth, progress=progress('fusing', 'view'),
     )  # fmt: skip
 
 
@@ -113,7 +113,7 @@ def _write_splatam(path: Path, run: RunRecord, gaussians: Gaussians) -> None:
 
 
 def _true_poses(run: RunRecord) -> NDArray[np.float64]:
-    """[T, 4, 4] T_world_cam of the tracked frames where the recording knows them; NaN elsewhere."""
+    """Returns the ground-truth T_world_cam [T, 4, 4] of the tracked frames; NaN where it is unknown."""
     import numpy as np
 
     from splatam_core.geometry.trajectory import interpolate_poses
@@ -128,5 +128,5 @@ def _true_poses(run: RunRecord) -> NDArray[np.float64]:
 
 
 COMMAND = Command(
-    'export', "write a run's map as Gaussians, points, a mesh, or for the original's programs", _add_arguments, export
+    'export', "write a run's map as Gaussians, points or a mesh, or for the original's programs", _add_arguments, export
 )

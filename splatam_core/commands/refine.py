@@ -1,4 +1,4 @@
-"""``splatam refine``: optimise a finished map over all frames of its run."""
+"""``splatam refine``: optimizes a finished map over all frames of its run."""
 
 from __future__ import annotations
 
@@ -13,28 +13,31 @@ from splatam_core.errors import RunFolderError
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_run_argument(parser)
     parser.add_argument('--out', type=Path, required=True, metavar='DIR', help='folder for the refined run')
-    parser.add_argument('--iterations', type=positive, default=2000, metavar='N', help='steps (default: %(default)s)')
+    parser.add_argument('--iterations', type=positive, default=2000, metavar='N', help='optimizer steps (default: %(default)s)')
     parser.add_argument(
         '--densify', action='store_true',
-        help='clone and split Gaussians where the image pulls at them, in the first half of the steps, as 3D Gaussian '
-        'splatting does; of use from 1000 steps on',
+        help='clone and split Gaussians of large screen-space gradient during the first half of the steps, as 3D Gaussian '
+        'splatting does; needs 1000 steps or more to help',
     )  # fmt: skip
-    parser.add_argument('--every', type=positive, default=1, metavar='N', help='score every n-th frame only, before and after')
+    parser.add_argument(
+        '--every', type=positive, default=1, metavar='N', help='score every n-th frame only, before and after refinement'
+    )
 
 
 def refine(args: argparse.Namespace) -> int:
-    """Optimise a finished map over all frames of its run."""
+    """Optimizes a finished map over all frames of its run."""
     from splatam_core.evaluation.images import mean_scores
     from splatam_core.evaluation.score import score_images
     from splatam_core.mapping.offline_refinement import refine_map
     from splatam_core.rasterizer import rasterizer_for
-    from splatam_core.runs.run_folder import check_is_free, write_refined
+    from splatam_core.runs.layout import check_is_free
+    from splatam_core.runs.writer import write_refined
 
     run = open_run(args.dir, args.device)
     rasterizer, device = rasterizer_for(run.config)
     gaussians = run.read_map().to(device)
     if run.description.source is None:
-        raise RunFolderError(f'{args.dir} does not say where its frames came from, so they cannot be read again')
+        raise RunFolderError(f"{args.dir}: its frames came from live topics; only runs of 'splatam run' can be refined")
     check_is_free(args.out)
     sequence = open_source(run.description.source)
     before = mean_scores(score_images(run, sequence, args.every, progress('scoring')).frames)
@@ -50,4 +53,4 @@ def refine(args: argparse.Namespace) -> int:
     return 0
 
 
-COMMAND = Command('refine', 'optimise a finished map over all frames of its run', _add_arguments, refine)
+COMMAND = Command('refine', 'optimize a finished map over all frames of its run', _add_arguments, refine)

@@ -1,4 +1,4 @@
-"""``splatam render``: film a run's map along a path."""
+"""``splatam render``: renders a run's map along a path."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_run_argument(parser)
     parser.add_argument(
         '--poses', type=Path, metavar='FILE',
-        help="TUM trajectory in the map's world, that of the run's first camera (default: the run's own trajectory)",
+        help="TUM trajectory in the map's world frame, which is the run's first camera (default: the run's own trajectory)",
     )  # fmt: skip
-    parser.add_argument('--out', type=Path, required=True, metavar='DIR', help='folder for pictures and videos')
-    parser.add_argument('--width', type=positive, metavar='W', help="of the pictures in pixels (default: the run's)")
-    parser.add_argument('--rate', type=positive, metavar='HZ', help="of the videos (default: the poses' own)")
+    parser.add_argument('--out', type=Path, required=True, metavar='DIR', help='folder for images and videos')
+    parser.add_argument('--width', type=positive, metavar='W', help="width of the images in pixels (default: the run's)")
+    parser.add_argument('--rate', type=positive, metavar='HZ', help='frame rate of the videos (default: that of the poses)')
     parser.add_argument('--no-images', action='store_true', help='write videos only')
-    parser.add_argument('--no-video', action='store_true', help='write pictures only')
+    parser.add_argument('--no-video', action='store_true', help='write images only')
 
 
 def render(args: argparse.Namespace) -> int:
-    """Film a run's map along a path."""
+    """Renders a run's map along a path."""
     from splatam_core.atomic_io import new_folder
     from splatam_core.geometry.trajectory import read_trajectory
     from splatam_core.maps.video import median_rate_hz, render_along
     from splatam_core.rasterizer import rasterizer_for
-    from splatam_core.runs.run_folder import check_is_free
+    from splatam_core.runs.layout import check_is_free
 
     if args.no_images and args.no_video:
         raise RunFolderError('--no-images and --no-video together leave nothing to write')
@@ -55,4 +55,4 @@ def render(args: argparse.Namespace) -> int:
     return 0
 
 
-COMMAND = Command('render', "film a run's map along a path: colour, depth, silhouette", _add_arguments, render)
+COMMAND = Command('render', "render a run's map along a path: colour, depth, silhouette", _add_arguments, render)

@@ -1,22 +1,25 @@
-"""What the commands of ``splatam`` share: their form, the arguments that name a recording, and how they speak."""
+"""What the commands of ``splatam`` share: their form, common arguments, opening recordings and runs, and messages."""
 
 from __future__ import annotations
 
 import argparse
+import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 from splatam_core.config import DEVICES, computed_on
 
 if TYPE_CHECKING:
     from splatam_core.config import SlamConfig
     from splatam_core.datasets.base import Sequence
-    from splatam_core.runs.run_folder import RunRecord, Source
+    from splatam_core.runs.record import RunRecord, Source
 
 BAG_SUFFIXES = ('.db3', '.mcap', '.bag')
+EXIT_ERROR = 2
+EXIT_INTERRUPTED = 130
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +29,8 @@ class Command:
     Attributes:
         name: as typed.
         help: one line.
-        add_arguments: declares its arguments.
-        run: does it; returns the exit code.
+        add_arguments: adds its arguments to a parser.
+        run: runs it; returns the exit code.
     """
 
     name: str
@@ -37,49 +40,74 @@ class Command:
 
 
 def add_source_arguments(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
-    """SOURCE and how to read it."""
+    """Adds SOURCE and how to read it."""
     parser.add_argument(
         'source',
         metavar='SOURCE',
         nargs='?' if optional else None,
         help='dataset folder, bag (folder, .db3, .mcap, ROS 1 .bag), synthetic[:seed=0,...]',
     )
-    parser.add_argument('--format', metavar='F', help='reader to use (default: guessed from SOURCE)')
-    parser.add_argument('--start', type=int, default=0, metavar='N', help='leave out the first N frames')
+    parser.add_argument('--format', metavar='F', help='reader of SOURCE (default: found from its files)')
+    parser.add_argument('--start', type=int, default=0, metavar='N', help='skip the first N frames')
     parser.add_argument('--max-frames', type=positive, metavar='N', help='read at most N frames')
-    parser.add_argument('--stride', type=positive, default=1, metavar='N', help='read every n-th frame only')
-    parser.add_argument('--width', type=positive, metavar='W', help='resize the frames to W pixels across')
-    parser.add_argument('--crop', type=int, default=0, metavar='P', help='cut P pixels off each edge, after resizing')
-    parser.add_argument('--split', choices=('train', 'test'), help='of Replica-V2 and ScanNet++ (default: train)')
-    parser.add_argument('--skip-bad', action='store_true', help='leave out what ScanNet++ flags as bad')
+    parser.add_argument('--stride', type=positive, default=1, metavar='N', help='read every n-th frame only (default: 1)')
+    parser.add_argument('--width', type=positive, metavar='W', help='resize the frames to a width of W pixels')
+    parser.add_argument('--crop', type=int, default=0, metavar='P', help='cut P pixels off each edge after resizing')
+    parser.add_argument('--split', choices=('train', 'test'), help='split of Replica-V2 and ScanNet++ to read (default: train)')
+    parser.add_argument('--skip-bad', action='store_true', help='skip the frames that ScanNet++ flags as bad')
     for topic, what in (('rgb', 'colour'), ('depth', 'depth'), ('info', 'camera info')):
         parser.add_argument(f'--{topic}', metavar='TOPIC', help=f'{what} topic of a bag (default: found by type)')
 
 
+def add_preset_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds --preset and --set."""
+    parser.add_argument('--preset', default='splatam', help='a shipped preset or a .yaml file (default: %(default)s)')
+    add_set_argument(parser)
+
+
+def add_set_argument(parser: argparse.ArgumentParser) -> None:
+    """Adds --set."""
+    parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE', help='change a setting; may be repeated')
+
+
 def add_run_argument(parser: argparse.ArgumentParser) -> None:
-    """DIR, a run's folder."""
-    parser.add_argument('dir', type=Path, metavar='DIR', help="folder of a run, the command line's or the node's")
-    add_device_argument(parser, "where to compute (default: as the run's settings say)")
+    """Adds DIR, a run folder, and --device."""
+    parser.add_argument('dir', type=Path, metavar='DIR', help='run folder, written by splatam run or the node')
+    add_device_argument(parser, "device to compute on (default: as the run's settings say)")
 
 
 def add_device_argument(parser: argparse.ArgumentParser, help: str) -> None:
-    """--device."""
+    """Adds --device."""
     parser.add_argument('--device', choices=DEVICES, help=help)
 
 
 def source_of(args: argparse.Namespace) -> Source:
-    """The recording that the arguments name."""
-    from splatam_core.runs.run_folder import Source
+    """Returns the recording that the arguments name."""
+    from splatam_core.runs.record import Source
 
     path = str(Path(args.source).resolve()) if Path(args.source).exists() else args.source
     return Source(
-        path, args.format, args.start, args.max_frames, args.width, args.rgb, args.depth, args.info,
-        args.stride, args.crop, args.split, args.skip_bad,
-    )  # fmt: skip
+        path=path,
+        format=args.format,
+        start=args.start,
+        max_frames=args.max_frames,
+        width=args.width,
+        rgb=args.rgb,
+        depth=args.depth,
+        info=args.info,
+        stride=args.stride,
+        crop=args.crop,
+        split=args.split,
+        skip_bad=args.skip_bad,
+    )
 
 
 def at_width(source: Source, config: SlamConfig) -> Source:
-    """The source at the configuration's width, where none was asked for and its frames are wider.
+    """Returns the source at the configuration's width if it names no width itself and its frames are wider.
+
+    Args:
+        source: the recording.
+        config: its ``width`` is used.
 
     Raises:
         DatasetError, CameraError: it cannot be read.
@@ -91,7 +119,7 @@ def at_width(source: Source, config: SlamConfig) -> Source:
 
 
 def source_words(source: Source) -> list[str]:
-    """The arguments that name a source, as they are typed."""
+    """Returns the command-line arguments that name a source."""
     given = {
         '--format': source.format, '--start': source.start, '--max-frames': source.max_frames, '--stride': source.stride,
         '--width': source.width, '--crop': source.crop, '--split': source.split, '--rgb': source.rgb,
@@ -102,7 +130,7 @@ def source_words(source: Source) -> list[str]:
 
 
 def open_source(source: Source) -> Sequence:
-    """Open a recording.
+    """Opens a recording.
 
     Raises:
         DatasetError, CameraError: it cannot be read.
@@ -125,17 +153,17 @@ def open_source(source: Source) -> Sequence:
 
 
 def open_run(path: Path, device: str | None = None) -> RunRecord:
-    """Read a run's folder and keep the libraries within its threads.
+    """Reads a run folder, and limits the libraries to the run's number of threads.
 
     Args:
         path: the folder.
         device: where to compute; None = as the run's settings say.
 
     Raises:
-        RunFolderError: it is no run folder, or one of its files is damaged.
+        RunFolderError: the path is no run folder, or one of its files is damaged.
     """
     from splatam_core.config import apply_threads
-    from splatam_core.runs.run_folder import read_run
+    from splatam_core.runs.record import read_run
 
     run = read_run(path)
     run = replace(run, config=computed_on(run.config, device))
@@ -143,8 +171,25 @@ def open_run(path: Path, device: str | None = None) -> RunRecord:
     return run
 
 
+def run_in_own_process(arguments: Iterable[object], stdout: IO[str] | None = None) -> int:
+    """Runs ``splatam`` in a process of its own, which frees all its memory in the end. Returns its exit code.
+
+    Args:
+        arguments: the words after ``splatam``.
+        stdout: where it prints; None = where this process prints.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C stopped it.
+    """
+    command = [sys.executable, '-m', 'splatam_core.cli', *map(str, arguments)]
+    code = subprocess.run(command, stdout=stdout, check=False).returncode
+    if code == EXIT_INTERRUPTED:
+        raise KeyboardInterrupt
+    return code
+
+
 def positive(text: str) -> int:
-    """A whole number that is at least 1, for argparse."""
+    """Returns a whole number of at least 1, for argparse."""
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f'{value} is not at least 1')
@@ -152,14 +197,14 @@ def positive(text: str) -> int:
 
 
 def progress(what: str, unit: str = 'frame') -> Callable[[range], Iterable[int]]:
-    """Wraps a loop in a progress bar that goes away when it is done."""
+    """Returns a wrapper for loops that shows a progress bar until the loop ends."""
     from tqdm import tqdm
 
     return lambda indices: tqdm(indices, unit=unit, desc=what, dynamic_ncols=True, leave=False, disable=None)
 
 
 def say(text: str) -> None:
-    """To the user, beside results and above a progress bar."""
+    """Prints a message to the user on stderr, above a progress bar."""
     from tqdm import tqdm
 
     tqdm.write(f'splatam: {text}', file=sys.stderr)

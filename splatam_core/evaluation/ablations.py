@@ -1,15 +1,13 @@
-"""What each part of SplaTAM is worth: the paper's ablations, one run each, and their table.
+"""The paper's ablations: what each part of SplaTAM contributes, as variants of a preset, and their table.
 
-A variant is a small file in ``config/ablations``, laid over a preset and over ``full.yaml``, which is where all start.
-Runs are folders of ``splatam run``; one that is finished is not done again.
+A variant is a small file in ``config/ablations``, applied on top of a preset and ``full.yaml``, from which all start.
+Each variant is one run of ``splatam run``.
 """
 
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,11 +15,11 @@ from typing import Any
 from splatam_core.config import SlamConfig, load_config, parse_overrides, read_values
 from splatam_core.errors import ConfigError, RunFolderError
 from splatam_core.resources import config_dir
+from splatam_core.runs.layout import METRICS, RUN
 from splatam_core.runs.metrics import Metrics
-from splatam_core.runs.run_folder import METRICS, RUN, Source, read_run
+from splatam_core.runs.record import Source, read_run
 
 FULL = 'full'
-EXIT_INTERRUPTED = 130
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,37 +27,42 @@ class Variant:
     """One run of a set.
 
     Attributes:
-        name: of its file, and of its folder.
-        preset: what it starts from.
-        overrides: dotted names to values, laid over that.
+        name: of its file, and of its run folder.
+        preset: the preset it starts from.
+        overrides: dotted names to values, applied on top of the preset.
     """
 
     name: str
     preset: str
-    overrides: dict[str, object]
+    overrides: Mapping[str, object]
 
     @property
     def config(self) -> SlamConfig:
         """All its settings."""
         return load_config(self.preset, self.overrides)
 
+    def words(self) -> list[str]:
+        """Returns its settings as arguments of ``splatam run``."""
+        settings = [word for name, value in self.overrides.items() for word in ('--set', f'{name}={json.dumps(value)}')]
+        return ['--preset', self.preset, *settings]
+
 
 def variant_names() -> list[str]:
-    """Those that ship, the unabridged one first."""
+    """Returns the variants that ship, ``full`` first."""
     names = sorted(path.stem for path in (config_dir() / 'ablations').glob('*.yaml'))
     return [FULL, *(name for name in names if name != FULL)]
 
 
 def variants(names: Iterable[str], preset: str, overrides: Sequence[str] = ()) -> list[Variant]:
-    """Chosen variants over a preset.
+    """Returns variants of a preset.
 
     Args:
         names: some of ``variant_names``.
         preset: a shipped preset or a YAML file.
-        overrides: texts ``name=value``, which win over everything.
+        overrides: texts ``name=value``, which take precedence over everything else.
 
     Raises:
-        ConfigError: an unknown variant, or a setting that is not allowed.
+        ConfigError: a variant is unknown, or a setting is not allowed.
     """
     known = variant_names()
     return [_variant(name, known, preset, parse_overrides(overrides)) for name in names]
@@ -70,54 +73,38 @@ def _variant(name: str, known: Sequence[str], preset: str, overrides: dict[str, 
         raise ConfigError(f"unknown ablation '{name}'; shipped: {', '.join(known)}")
     full, own = (read_values(str(config_dir() / 'ablations' / f'{stem}.yaml')) for stem in (FULL, name))
     variant = Variant(name, preset, full | own | overrides)
-    variant.config  # noqa: B018 -- what cannot run should be said before the first run
+    variant.config  # noqa: B018 -- raises before the first run, not hours later
     return variant
 
 
-def run(variant: Variant, arguments: Sequence[str], source: Source, folder: Path) -> bool:
-    """Run a variant in a process of its own, unless that was done before.
+def is_finished(variant: Variant, source: Source, folder: Path) -> bool:
+    """Returns True if the folder holds the variant's run, with scores.
 
     Args:
-        variant: what to run.
-        arguments: of ``splatam run``: the recording and how to read it.
-        source: the same, as a run's folder states it.
+        variant: whose run.
+        source: the recording it must be of.
         folder: of the run.
 
-    Returns:
-        Whether it came to its end.
-
     Raises:
-        RunFolderError: another run is in the folder.
-    """
-    if is_finished(variant, source, folder):
-        return True
-    settings = [word for name, value in variant.overrides.items() for word in ('--set', f'{name}={json.dumps(value)}')]
-    command = ['run', *arguments, '--preset', variant.preset, *settings, '--out', str(folder), '--overwrite']
-    code = subprocess.run([sys.executable, '-m', 'splatam_core.cli', *command], stdout=sys.stderr, check=False).returncode
-    if code == EXIT_INTERRUPTED:
-        raise KeyboardInterrupt
-    return code == 0
-
-
-def is_finished(variant: Variant, source: Source, folder: Path) -> bool:
-    """Whether a variant's run is there, scored.
-
-    Raises:
-        RunFolderError: something else is there.
+        RunFolderError: the folder holds another run.
     """
     if not (folder / RUN).is_file():
         return False
     record = read_run(folder)
     if record.config != variant.config or record.description.source != source:
-        raise RunFolderError(f'{folder} holds a run of other settings or of another recording: choose another --out')
+        raise RunFolderError(f'{folder} holds a run with other settings or of another recording: choose another --out')
     return (folder / METRICS).is_file() and record.metrics().psnr_db is not None
 
 
 COLUMNS = 'variant', 'tracked', 'ATE RMSE cm', 'depth L1 cm', 'PSNR dB', 'SSIM', 'Gaussians', 's/frame'
 
 
-def table(folders: dict[str, Path]) -> str:
-    """Variant to folder of its run, as Markdown; a run that has no result is a row of dashes."""
+def table(folders: Mapping[str, Path]) -> str:
+    """Returns the scores of runs as a Markdown table; a run without results is a row of dashes.
+
+    Args:
+        folders: name of a variant to its run folder.
+    """
     lines = [COLUMNS, ('---',) * len(COLUMNS), *(_row(name, folder) for name, folder in folders.items())]
     return '\n'.join('| ' + ' | '.join(cells) + ' |' for cells in lines)
 
@@ -139,7 +126,7 @@ def _text(value: float | None, factor: float, digits: str) -> str:
 
 
 def provenance(folders: Iterable[Path]) -> str:
-    """The commits and machines of some runs, one line each way they differ."""
+    """Returns commit and machine of some runs; each combination once."""
     facts = [json.loads((folder / RUN).read_text()) for folder in folders if (folder / RUN).is_file()]
     return '; '.join(dict.fromkeys(map(_provenance, facts)))
 

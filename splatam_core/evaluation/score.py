@@ -24,7 +24,7 @@ from splatam_core.evaluation.trajectory import (
 from splatam_core.geometry.trajectory import Trajectory, interpolate_poses, stamp_text
 from splatam_core.rasterizer import rasterizer_for
 from splatam_core.runs.metrics import Metrics
-from splatam_core.runs.run_folder import RunRecord
+from splatam_core.runs.record import RunRecord
 from splatam_core.types import RgbdFrame
 
 Progress = Callable[[range], Iterable[int]]

@@ -1,1 +1,1 @@
-"""Run folders: what a run writes, and how it resumes."""
+"""Run folders: written during a run, read by the commands, and resumed from checkpoints."""

@@ -1,7 +1,8 @@
-r"""Files of values and arrays that are whole or refused, and in which nothing can be executed.
+r"""Archives: files of JSON values and arrays. A damaged or foreign file is refused, and nothing in a file is executed.
 
-One line of ASCII, ``splatam_ros KIND VERSION SHA-256 of the rest``, then an npz archive: the arrays, and the values as JSON
-in the array ``values``. ``numpy.load(io.BytesIO(path.read_bytes().split(b'\n', 1)[1]))`` reads it without this package.
+One line of ASCII, ``splatam_ros KIND VERSION SHA-256 of the rest``, then an npz file: the arrays, and the values as JSON in
+the array ``values``. ``numpy.load(io.BytesIO(path.read_bytes().split(b'\n', 1)[1]))`` reads it without this package.
+docs/decisions/0007-archive-format.md compares it with safetensors.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from splatam_core.atomic_io import replaced
-from splatam_core.errors import CheckpointError
+from splatam_core.errors import CheckpointError, one_line
 from splatam_core.types import Arrays
 
 MAGIC = 'splatam_ros'
@@ -28,11 +29,11 @@ _MAX_HEADER_BYTES = 128
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Content:
-    """What a sealed file holds.
+    """What an archive holds.
 
     Attributes:
-        values: whatever JSON can say.
-        arrays: by name; not of objects.
+        values: anything that JSON can express.
+        arrays: by name; no arrays of objects.
     """
 
     values: Mapping[str, Any]
@@ -40,13 +41,13 @@ class Content:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SealedFile:
-    """A file's bytes, not written yet.
+class ArchiveFile:
+    """The bytes of an archive that is not written yet.
 
     Attributes:
         digest: SHA-256 of the payload, hexadecimal.
-        header: first line.
-        payload: the archive.
+        header: the first line.
+        payload: the npz file.
     """
 
     digest: str
@@ -54,43 +55,50 @@ class SealedFile:
     payload: memoryview
 
     def write(self, path: Path) -> None:
-        """Write the file in one step, in place of the one that is there.
+        """Writes the file in one step; it replaces the file at the path.
 
         Raises:
-            OSError: it cannot be written; what was there before stays.
+            OSError: the file cannot be written; what was at the path stays.
         """
         with replaced(path) as temporary, temporary.open('wb') as file:
             file.write(self.header)
             file.write(self.payload)
 
 
-def seal(kind: str, version: int, content: Content) -> SealedFile:
-    """The file of some content; of equal content the same, byte for byte."""
+def pack(kind: str, version: int, content: Content) -> ArchiveFile:
+    """Returns the archive of some content. Equal content gives equal bytes.
+
+    Args:
+        kind: one word that says what the content is.
+        version: of the content's form.
+        content: to be written.
+    """
     buffer = io.BytesIO()
     values = np.frombuffer(json.dumps(content.values).encode(), np.uint8)
-    np.savez(buffer, allow_pickle=False, **{_VALUES: values}, **content.arrays)
+    arrays: dict[str, Any] = {_VALUES: values, **content.arrays}
+    np.savez(buffer, allow_pickle=False, **arrays)
     payload = buffer.getbuffer()
     digest = hashlib.sha256(payload).hexdigest()
-    return SealedFile(digest, f'{MAGIC} {kind} {version} {digest}\n'.encode('ascii'), payload)
+    return ArchiveFile(digest, f'{MAGIC} {kind} {version} {digest}\n'.encode('ascii'), payload)
 
 
-def unseal(path: Path, kind: str, version: int, digest: str | None = None) -> Content:
-    """Read a file back.
+def read_archive(path: Path, kind: str, version: int, digest: str | None = None) -> Content:
+    """Reads an archive.
 
     Args:
         path: the file.
-        kind: what it has to be.
-        version: the format it has to have.
-        digest: of the file that is meant; None = any.
+        kind: the kind it must have.
+        version: the version it must have.
+        digest: the SHA-256 that it must have, hexadecimal; None = any.
 
     Raises:
-        CheckpointError: it cannot be read, is another thing, of another version or another content, or damaged.
+        CheckpointError: the file cannot be read, is damaged, or has another kind, version or digest.
     """
     try:
         data = path.read_bytes()
     except OSError as error:
         raise CheckpointError(f'{path}: cannot be read: {error.strerror}') from None
-    header, newline, payload = data[:_MAX_HEADER_BYTES].partition(b'\n')
+    header, newline, _ = data[:_MAX_HEADER_BYTES].partition(b'\n')
     stated = _stated_digest(path, header if newline else data[:_MAX_HEADER_BYTES], kind, version)
     payload = memoryview(data)[len(header) + 1 :]
     found = hashlib.sha256(payload).hexdigest()
@@ -118,6 +126,5 @@ def _unpack(path: Path, payload: memoryview) -> Content:
             arrays = {name: archive[name] for name in archive.files}
         values = json.loads(arrays.pop(_VALUES).tobytes())
     except (ValueError, KeyError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile) as error:
-        reason = ' '.join(str(error).split())
-        raise CheckpointError(f'{path}: holds something else than arrays of numbers: {reason}') from None
+        raise CheckpointError(f'{path}: holds something else than arrays of numbers: {one_line(error)}') from None
     return Content(values, arrays)

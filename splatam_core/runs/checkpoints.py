@@ -1,14 +1,14 @@
-"""Checkpoints: all that the frames to come depend on, so that a run that was broken off goes on as if it had not been.
+"""Checkpoints: everything that later frames depend on, so that a resumed run ends like an uninterrupted one.
 
 ::
 
     checkpoints/
-        000040.checkpoint     after 40 frames: map, optimiser, motion, random numbers, and which keyframes
+        000040.checkpoint     after 40 frames: map, optimizer, motion, random numbers, and names of keyframes
         000060.checkpoint     after 60
         keyframes/
-            3f0c….keyframe    images and pose, named by their checksum: written once, shared by all checkpoints
+            3f0c….keyframe    images and pose, named by their SHA-256: written once, shared by all checkpoints
 
-A checkpoint is written after its keyframes and in one step: whatever interrupts that, the one before is whole.
+The keyframes are written first, and each file in one step: whatever interrupts that, the previous checkpoint stays whole.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from splatam_core.config import SlamConfig, flat_values, with_values
 from splatam_core.errors import CheckpointError, SplatamError
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.images.view import View
-from splatam_core.mapping.keyframes import PosedView
-from splatam_core.runs.archive import Content, seal, unseal
+from splatam_core.mapping.posed import PosedView
+from splatam_core.retired_settings import migrated
+from splatam_core.runs.archive import Content, pack, read_archive
 from splatam_core.state import SlamState
 from splatam_core.tracking.motion import MotionState
 
@@ -37,13 +38,13 @@ _MAP = 'map.'
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a recording has been processed.
+    """How much of a recording is processed.
 
     Attributes:
-        length: frames of the recording.
-        last_index: index of the last frame processed.
-        last_digest: of that frame, see ``resuming.frame_digest``.
-        num_lines: frames written down in the run's folder.
+        length: number of frames of the recording.
+        last_index: index of the last processed frame.
+        last_digest: of that frame, see ``resume.frame_digest``.
+        num_lines: number of frames in the run folder.
     """
 
     length: int
@@ -54,11 +55,11 @@ class Progress:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checkpoint:
-    """A checkpoint that was read.
+    """A checkpoint, read.
 
     Attributes:
         path: the file.
-        state: of Slam.
+        state: of ``Slam``.
         progress: in the recording.
     """
 
@@ -68,14 +69,14 @@ class Checkpoint:
 
 
 class Checkpoints:
-    """Writes the checkpoints of one run. Not for several at once."""
+    """Writes the checkpoints of one run. It is not thread-safe."""
 
     def __init__(self, folder: Path, keep: int) -> None:
-        """Write nothing yet.
+        """Writes nothing yet.
 
         Args:
             folder: the run's ``checkpoints/``.
-            keep: how many to keep; older ones are removed.
+            keep: number of checkpoints to keep; older ones are removed.
         """
         self._folder = folder
         self._keep = keep
@@ -83,16 +84,16 @@ class Checkpoints:
         self._needed: dict[Path, frozenset[str]] = {}
 
     def save(self, state: SlamState, progress: Progress) -> Path:
-        """Write a checkpoint, then remove what is too old. Returns the new file's path.
+        """Writes a checkpoint, then removes those that are too old. Returns the path of the new file.
 
         Raises:
-            OSError: it cannot be written; the checkpoints that are there stay.
+            OSError: it cannot be written; the existing checkpoints stay.
         """
         (self._folder / KEYFRAMES).mkdir(parents=True, exist_ok=True)
         self._written = {keyframe: self._write_keyframe(keyframe) for keyframe in state.keyframes}
         digests = tuple(self._written.values())
         path = self._folder / f'{progress.num_lines:06d}.{KIND}'
-        seal(KIND, VERSION, _pack(state, progress, digests)).write(path)
+        pack(KIND, VERSION, _to_content(state, progress, digests)).write(path)
         self._needed[path] = frozenset(digests)
         self._remove_old()
         return path
@@ -104,7 +105,7 @@ class Checkpoints:
             'rgb8': keyframe.view.rgb8.numpy(force=True), 'depth': keyframe.view.depth.numpy(force=True),
             'T_cam_world': keyframe.T_cam_world.numpy(force=True),
         }  # fmt: skip
-        file = seal(KEYFRAME, VERSION, Content({}, arrays))
+        file = pack(KEYFRAME, VERSION, Content({}, arrays))
         file.write(_keyframe_path(self._folder, file.digest))
         return file.digest
 
@@ -120,53 +121,55 @@ class Checkpoints:
             path.unlink(missing_ok=True)
 
     def _digests_in(self, path: Path) -> frozenset[str]:
-        """Keyframes of a checkpoint; a newer one need not have them all (``keyframes.budget``)."""
+        """Returns the keyframes of a checkpoint. A newer checkpoint may lack some of them (``keyframes.budget``)."""
         if path not in self._needed:  # written before the run was resumed
             try:
-                self._needed[path] = frozenset(unseal(path, KIND, VERSION).values['keyframes'])
+                self._needed[path] = frozenset(read_archive(path, KIND, VERSION).values['keyframes'])
             except (CheckpointError, KeyError, TypeError):
-                self._needed[path] = frozenset()  # it cannot be used anyway
+                self._needed[path] = frozenset()  # the checkpoint is unusable with or without them
         return self._needed[path]
 
 
 def checkpoint_paths(folder: Path) -> list[Path]:
-    """The checkpoints in a run's ``checkpoints/``, the newest last."""
+    """Returns the checkpoints in a run's ``checkpoints/``, the newest last."""
     paths = (path for path in folder.glob(f'*.{KIND}') if path.stem.isdecimal())
     return sorted(paths, key=lambda path: int(path.stem))
 
 
 def read_newest(folder: Path) -> Checkpoint:
-    """Read the newest checkpoint in a run's ``checkpoints/``.
+    """Reads the newest checkpoint in a run's ``checkpoints/``.
 
     Raises:
         CheckpointError: there is none, or it cannot be used.
     """
     paths = checkpoint_paths(folder)
     if not paths:
-        raise CheckpointError(f"{folder} holds no checkpoint: run with '--checkpoint-every N' to have some")
+        raise CheckpointError(f"{folder} holds no checkpoint: run with '--checkpoint-every N' to write some")
     try:
         return read_checkpoint(paths[-1])
     except CheckpointError as error:
-        way_out = f'to go on from {paths[-2].name}' if len(paths) > 1 else 'and start anew: it is the only one'
+        way_out = f'to resume from {paths[-2].name}' if len(paths) > 1 else 'and start a new run: it is the only one'
         raise CheckpointError(f'{error}; move {paths[-1].name} away {way_out}') from None
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """Read a checkpoint and its keyframes.
+    """Reads a checkpoint and its keyframes. Settings of earlier versions get their present names.
 
     Raises:
         CheckpointError: one of the files is missing, damaged, of another version or no checkpoint.
     """
-    content = unseal(path, KIND, VERSION)
+    content = read_archive(path, KIND, VERSION)
     try:
-        return _unpack(path, content)
+        return _from_content(path, content)
     except CheckpointError:
         raise
     except (KeyError, TypeError, ValueError, SplatamError) as error:
-        raise CheckpointError(f'{path}: is no checkpoint that this version understands: {error!r}') from None
+        raise CheckpointError(
+            f'{path}: is no checkpoint that this version understands: {error!r}; use the version that wrote it'
+        ) from None
 
 
-def _pack(state: SlamState, progress: Progress, digests: Sequence[str]) -> Content:
+def _to_content(state: SlamState, progress: Progress, digests: Sequence[str]) -> Content:
     motion = state.motion
     values = {
         'config': flat_values(state.config), 'camera': None if state.camera is None else asdict(state.camera),
@@ -178,12 +181,12 @@ def _pack(state: SlamState, progress: Progress, digests: Sequence[str]) -> Conte
     return Content(values, arrays | {'T_world_cam': motion.T_world_cam, 'velocity': motion.velocity})
 
 
-def _unpack(path: Path, content: Content) -> Checkpoint:
+def _from_content(path: Path, content: Content) -> Checkpoint:
     values, arrays = content.values, content.arrays
     camera = None if values['camera'] is None else PinholeCamera(**values['camera'])
     stamp_ns, interval_ns = values['motion_ns']
     state = SlamState(
-        config=with_values(SlamConfig(), values['config']),
+        config=with_values(SlamConfig(), migrated(values['config'])),
         camera=camera,
         map={name.removeprefix(_MAP): array for name, array in arrays.items() if name.startswith(_MAP)},
         keyframes=tuple(_read_keyframe(path.parent, digest, camera) for digest in values['keyframes']),
@@ -200,10 +203,11 @@ def _read_keyframe(folder: Path, digest: str, camera: PinholeCamera | None) -> P
     path = _keyframe_path(folder, digest)
     if camera is None:
         raise CheckpointError(f'{path}: is no keyframe of this run, which has no camera')
-    arrays = unseal(path, KEYFRAME, VERSION, digest).arrays
+    arrays = read_archive(path, KEYFRAME, VERSION, digest).arrays
     rgb8, depth, T_cam_world = (arrays[name] for name in ('rgb8', 'depth', 'T_cam_world'))
     if depth.ndim == 2 and depth.shape != (camera.height, camera.width):  # kept at another size (mapping.scale)
-        camera = camera.resized(*depth.shape[::-1])
+        height, width = depth.shape
+        camera = camera.resized(width, height)
     size = (camera.height, camera.width)
     expected = [('uint8', (*size, 3)), ('float32', size), ('float32', (4, 4))]
     found = [(array.dtype.name, array.shape) for array in (rgb8, depth, T_cam_world)]
@@ -217,7 +221,7 @@ def _keyframe_path(folder: Path, digest: str) -> Path:
 
 
 def _unfinished(folder: Path) -> Iterator[Path]:
-    """What was left by a process that was killed while it wrote."""
+    """Yields what a process left behind that was killed while it wrote."""
     for path in (*folder.glob(f'.*.{KIND}.*'), *folder.glob(f'{KEYFRAMES}/.*.{KEYFRAME}.*')):
         if is_unfinished(path.name, (path.name.removeprefix('.').rpartition('.')[0],)):
             yield path

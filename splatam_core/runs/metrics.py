@@ -1,4 +1,4 @@
-"""The numbers of a run, ``metrics.json``. What each of them means is fixed; null is 'cannot be known'."""
+"""The numbers of a run, ``metrics.json``. docs/evaluation.md defines each number; null means that it is not known."""
 
 from __future__ import annotations
 
@@ -10,23 +10,22 @@ from typing import Any
 import numpy as np
 
 from splatam_core.errors import RunFolderError
-from splatam_core.types import StageTimings
-
-STAGES = tuple(entry.name for entry in fields(StageTimings))
+from splatam_core.runs.frame_records import STAGES, FrameRecord
+from splatam_core.types import StageTimings, Status
 
 
 @dataclass(frozen=True, slots=True)
 class ImageScores:
-    """One view's scores, or their mean over views.
+    """Scores of one view, or their mean over views.
 
     Attributes:
         psnr_db: of the colour over the pixels with a depth reading; None where there is no such pixel.
-        ssim: likewise.
-        depth_l1_m: mean absolute difference to the reading; a pixel that renders no depth differs by all of it.
+        ssim: over the same pixels.
+        depth_l1_m: mean absolute difference to the reading; a pixel that renders no depth differs by the whole reading.
         psnr_full_db: of the colour over the whole image, holes included.
         depth_rmse_m: root of the mean squared difference to the reading.
         ms_ssim: of whole images; None where they are too small for it.
-        lpips: of whole images; None where it cannot be had.
+        lpips: of whole images; None where the package is not installed.
     """
 
     psnr_db: float | None = None
@@ -40,12 +39,12 @@ class ImageScores:
 
 @dataclass(frozen=True, slots=True)
 class OriginalScores:
-    """What SplaTAM's evaluation computes: both images black where there is no reading, and those pixels count.
+    """What SplaTAM's own evaluation computes: both images are black where there is no reading, and those pixels count.
 
     Attributes:
-        psnr_db: mean of the channels' PSNR, the render not clamped.
+        psnr_db: mean of the channels' PSNR; the render is not clamped.
         ms_ssim: which the original prints as "SSIM".
-        lpips: AlexNet.
+        lpips: of AlexNet.
         depth_l1_m: of the sum of ``w z``, not divided by the silhouette; the original prints it as "Depth RMSE" too.
     """
 
@@ -65,47 +64,47 @@ class StageStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Metrics:
-    """What a run is judged by; docs/evaluation.md defines each number.
+    """All numbers of a run.
 
     Attributes:
-        frames: frames processed.
-        tracked: those with a pose, the first included.
-        lost: those without.
+        frames: number of frames processed.
+        tracked: number of frames with a pose, the first included.
+        lost: number of frames without a pose.
         fps: frames / time spent in SLAM, decoding excluded.
-        fps_with_io: frames / that time and the time spent decoding; None where decoding went on beside SLAM.
+        fps_with_io: frames / time spent in SLAM and decoding; None where another thread decoded during SLAM.
         num_gaussians: size of the final map; None where it was not saved.
-        peak_rss_mb: most memory the process held, MiB.
+        peak_rss_mb: largest memory of the process, MiB.
         timings_ms: wall time of each stage over the frames.
-        finish_s: wall time of fitting the map once more after the last frame; the two rates count it.
-        peak_gpu_mb: most memory its tensors took on a GPU, MiB; None where there were none.
-        ate_rmse_m: root mean squared distance of the camera centres to the truth, all tracked frames, SE(3)-aligned.
-        ate_frames: tracked frames that have a truth and thus enter ``ate_rmse_m``.
+        finish_s: wall time of the final passes over the keyframes after the last frame; both rates include it.
+        peak_gpu_mb: largest memory of its tensors on a GPU, MiB; None where no GPU was used.
+        ate_rmse_m: root mean squared distance of the camera centres to the ground truth, all tracked frames, SE(3)-aligned.
+        ate_frames: number of tracked frames with ground truth, which enter ``ate_rmse_m``.
         splatam_ate_mean_m: what the original prints as "ATE RMSE".
         rpe_trans_frame_m: relative pose error from frame to frame, RMSE of the translation.
         rpe_rot_frame_deg: of the rotation.
-        rpe_frame_pairs: pairs of frames that entered.
+        rpe_frame_pairs: number of pairs of frames that entered.
         rpe_trans_1s_m: the same over one second.
         rpe_rot_1s_deg: of the rotation.
-        rpe_1s_pairs: pairs of frames that entered.
+        rpe_1s_pairs: number of pairs of frames that entered.
         psnr_db: final map rendered at the estimated poses, over the pixels with a depth reading, mean over frames.
-        ssim: likewise.
-        depth_l1_m: likewise, of the expected depth.
+        ssim: over the same pixels.
+        depth_l1_m: of the expected depth, over the same pixels.
         psnr_full_db: over whole images, holes included.
         depth_rmse_m: of the expected depth, over the pixels with a reading.
         ms_ssim: of whole images.
         lpips: of whole images.
-        evaluated_every: every n-th frame entered the seven above; None before they are evaluated.
-        evaluated_frames: frames that entered them.
+        evaluated_every: every n-th frame entered the seven above; None before the evaluation.
+        evaluated_frames: number of frames that entered them.
         splatam: the same frames, scored as the original does.
-        heldout_frames: frames kept out of the map that entered ``heldout``; None where there are none.
-        heldout: the scores of those, at their estimated poses.
-        novel_alignment: how the truth of a test split was brought into the map: ``trajectory`` or ``first``.
-        novel_frames: its views without holes, which entered ``novel``.
+        heldout_frames: number of frames in ``heldout``; None where no frame was held out.
+        heldout: scores of the frames held out of the map, at their estimated poses.
+        novel_alignment: how the ground truth of a test split was aligned to the map: ``trajectory`` or ``first``.
+        novel_frames: number of test views without holes, which entered ``novel``.
         novel: their scores, at their true poses.
-        novel_holes_frames: its views with holes.
+        novel_holes_frames: number of test views with holes.
         novel_holes: their scores.
         splatam_novel: the views without holes, scored as the original does.
-        notes: why a number is null, by its name, where that needs saying.
+        notes: why a number is null, by its name, where that is not obvious.
     """
 
     frames: int
@@ -148,7 +147,7 @@ class Metrics:
     notes: Mapping[str, str] = field(default_factory=dict)
 
     def values(self) -> dict[str, Any]:
-        """Every number by its name in ``metrics.json``: a group's scores carry its name in front."""
+        """Returns every number by its name in ``metrics.json``; scores of a group have the group's name in front."""
         flat: dict[str, Any] = {}
         for entry in fields(self):
             value = getattr(self, entry.name)
@@ -159,7 +158,7 @@ class Metrics:
         return flat
 
     def to_json(self) -> str:
-        """As the text of ``metrics.json``."""
+        """Returns the text of ``metrics.json``."""
         values = self.values()
         values['timings_ms'] = {name: asdict(stage) for name, stage in self.timings_ms.items()}
         values['notes'] = dict(self.notes)
@@ -167,10 +166,10 @@ class Metrics:
 
     @classmethod
     def from_json(cls, text: str) -> Metrics:
-        """Read back what ``to_json`` wrote; names of other versions are passed over.
+        """Reads what ``to_json`` wrote; unknown names, of other versions, are ignored.
 
         Raises:
-            RunFolderError: the text is no JSON object, or lacks a name.
+            RunFolderError: the text is no JSON object, or a required number is missing.
         """
         try:
             values = json.loads(text)
@@ -182,18 +181,54 @@ class Metrics:
             raise RunFolderError(f'metrics.json cannot be read: {error}; delete it and evaluate again') from None
 
 
-GROUPS = {
+GROUPS: Mapping[str, type[ImageScores] | type[OriginalScores]] = {
     'splatam': OriginalScores, 'heldout': ImageScores, 'novel': ImageScores, 'novel_holes': ImageScores,
     'splatam_novel': OriginalScores,
 }  # fmt: skip
+"""The fields of ``Metrics`` that are written as one number per score, to their types."""
 
 
-def _group(name: str, kind: type[ImageScores | OriginalScores], values: Mapping[str, Any]) -> ImageScores | OriginalScores:
+def _group(name: str, kind: type[ImageScores] | type[OriginalScores], values: Mapping[str, Any]) -> ImageScores | OriginalScores:
     return kind(**{entry.name: values.get(f'{name}_{entry.name}') for entry in fields(kind)})
 
 
+def run_metrics(
+    records: Sequence[FrameRecord], num_gaussians: int | None = None, peak_rss_mb: float | None = None, *,
+    peak_gpu_mb: float | None = None, finish_s: float = 0.0,
+) -> Metrics:  # fmt: skip
+    """Returns the metrics that need no ground truth.
+
+    Args:
+        records: the frames of the run.
+        num_gaussians: size of the final map; None where it was not saved.
+        peak_rss_mb: largest memory of the process, MiB; None where unknown.
+        peak_gpu_mb: largest memory on a GPU, MiB; None where no GPU was used.
+        finish_s: wall time in ``Slam.finish``.
+    """
+    lost = sum(record.status is Status.LOST for record in records)
+    process_ms = sum(record.process_ms for record in records) + 1e3 * finish_s
+    decode_ms = [record.decode_ms for record in records if record.decode_ms is not None]
+    with_io_ms = process_ms + sum(decode_ms) if len(decode_ms) == len(records) else 0.0
+    return Metrics(
+        frames=len(records),
+        tracked=len(records) - lost,
+        lost=lost,
+        fps=_rate(len(records), process_ms),
+        fps_with_io=_rate(len(records), with_io_ms),
+        num_gaussians=num_gaussians,
+        peak_rss_mb=peak_rss_mb,
+        timings_ms=stage_statistics([record.timings for record in records]),
+        finish_s=round(finish_s, 3),
+        peak_gpu_mb=peak_gpu_mb,
+    )
+
+
+def _rate(frames: int, wall_ms: float) -> float | None:
+    return round(frames / wall_ms * 1e3, 3) if wall_ms > 0 else None
+
+
 def stage_statistics(timings: Sequence[StageTimings]) -> dict[str, StageStatistics]:
-    """Median and 95th percentile of each stage; empty without frames."""
+    """Returns median and 95th percentile of each stage over the frames; empty without frames."""
     if not timings:
         return {}
     table = np.array([[getattr(frame, stage) for stage in STAGES] for frame in timings])  # [frames, stages]

@@ -1,4 +1,4 @@
-"""What a run ran on: the facts that make its numbers comparable."""
+"""The code, libraries and machine of a run: without them its numbers cannot be compared."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DISTRIBUTION = 'splatam_ros'
 
 
 def package_version() -> str | None:
-    """The installed version; None where the code runs without having been installed."""
+    """Returns the installed version of this package; None where it runs without being installed."""
     try:
         return version(DISTRIBUTION)
     except PackageNotFoundError:
@@ -24,9 +24,9 @@ def package_version() -> str | None:
 
 
 def commit() -> str | None:
-    """The commit this code is of, with ``-dirty`` when it was changed since; None outside its repository.
+    """Returns the commit of this code, with ``-dirty`` if it has changed since; None outside its repository.
 
-    A virtual environment inside some repository is not of that repository: this very file must be tracked in it.
+    A virtual environment may lie inside another repository, so the repository counts only if it tracks this file.
     """
     if _git('ls-files', '--error-unmatch', Path(__file__).name) is None:
         return None
@@ -43,7 +43,7 @@ def _git(*arguments: str) -> str | None:
 
 
 def machine() -> dict[str, str | int | None]:
-    """Processor, usable cores, memory, system, and the GPU that torch sees, if any."""
+    """Returns processor, usable cores, memory, system, and the GPU that torch sees, if any."""
     return {
         'system': platform.platform(),
         'processor': _processor(),
@@ -59,7 +59,7 @@ def _processor() -> str:
 
 
 def versions() -> dict[str, str | None]:
-    """Versions of this package and of what its numbers depend on."""
+    """Returns the versions of this package and of the libraries that affect its numbers."""
     return {
         DISTRIBUTION: package_version(),
         'python': platform.python_version(),
@@ -70,25 +70,25 @@ def versions() -> dict[str, str | None]:
 
 
 def peak_rss_mb() -> float | None:
-    """Most memory this process held at once, MiB; None where the system does not say."""
+    """Returns the largest memory of this process so far, MiB; None where the system does not tell."""
     peak = _fields(Path('/proc/self/status')).get('VmHWM')  # unlike ru_maxrss not inherited from the parent
     return None if peak is None else round(int(peak.split()[0]) / 1024, 1)
 
 
 def peak_gpu_mb() -> float | None:
-    """Most memory this process's tensors took on a GPU at once, MiB; None where none was on one."""
+    """Returns the largest memory of this process's tensors on a GPU so far, MiB; None where no GPU was used."""
     peak = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0
     return round(peak / 2**20, 1) if peak else None
 
 
 def rss_mb() -> float | None:
-    """Memory the process holds now; None where the system does not say."""
+    """Returns the present memory of this process, MiB; None where the system does not tell."""
     held = _fields(Path('/proc/self/status')).get('VmRSS')
     return int(held.split()[0]) / 1024 if held else None
 
 
 def _fields(path: Path) -> dict[str, str]:
-    """The ``name: value`` lines of a file in /proc; nothing where there is no such file."""
+    """Returns the ``name: value`` lines of a file in /proc; empty where there is no such file."""
     if not path.exists():
         return {}
     pairs = (line.partition(':') for line in path.read_text().splitlines())

@@ -1,4 +1,4 @@
-"""Runs over a recording that save checkpoints, and go on from the last one when they were broken off."""
+"""Runs over a recording: how they begin, save checkpoints, and resume after an interruption."""
 
 from __future__ import annotations
 
@@ -6,34 +6,48 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from splatam_core.config import WHERE, SlamConfig, computed_on, flat_values
+from splatam_core.datasets.base import Sequence as FrameSequence
+from splatam_core.datasets.known_poses import FramesWithTruth
 from splatam_core.errors import CheckpointError
 from splatam_core.runs import provenance
 from splatam_core.runs.checkpoints import Checkpoint, Checkpoints, Progress, read_newest
-from splatam_core.runs.offline import prepare
-from splatam_core.runs.run_folder import CHECKPOINTS, RunFolder, RunSettings, read_run, read_settings, trim_run
+from splatam_core.runs.layout import CHECKPOINTS, CONFIG
+from splatam_core.runs.record import RunSettings, Source, read_settings
+from splatam_core.runs.writer import RunFolder
 from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame
 
-if TYPE_CHECKING:
-    from splatam_core.datasets.base import Sequence as FrameSequence
-    from splatam_core.runs.run_folder import Source
+
+def prepare(sequence: FrameSequence, config: SlamConfig) -> tuple[FrameSequence, Slam]:
+    """Returns the frames to process, and a ``Slam`` with an empty map for them.
+
+    Args:
+        sequence: the recording.
+        config: of the run.
+
+    Raises:
+        ConfigError: ``tracking.method`` is ``truth``, and the recording has no ground truth.
+    """
+    if config.tracking.method != 'truth':
+        return sequence, Slam(config, num_frames=len(sequence))
+    frames = FramesWithTruth(sequence)
+    return frames, Slam(config, true_motion=frames.motion, num_frames=len(frames))
 
 
 class CheckpointWriter:
-    """Saves a checkpoint every so many frames. One that cannot be written stops nothing."""
+    """Saves a checkpoint every few frames. A checkpoint that cannot be written is reported and stops nothing."""
 
     def __init__(self, folder: RunFolder, length: int, every: int | None, keep: int, say: Callable[[str], None]) -> None:
-        """Write nothing yet.
+        """Writes nothing yet.
 
         Args:
             folder: of the run.
-            length: frames of the recording.
+            length: number of frames of the recording.
             every: frames from one checkpoint to the next; None = write none.
-            keep: how many to keep.
-            say: tells the user.
+            keep: number of checkpoints to keep.
+            say: shows a message to the user.
         """
         self._folder, self._length, self._every, self._say = folder, length, every, say
         self._checkpoints = Checkpoints(folder.path / CHECKPOINTS, keep)
@@ -41,19 +55,19 @@ class CheckpointWriter:
         self._saved = folder.num_frames
 
     def after_frame(self, index: int, frame: RgbdFrame, slam: Slam) -> None:
-        """Save if it is time to.
+        """Saves a checkpoint after every n-th frame.
 
         Args:
             index: of the frame in the recording.
-            frame: which is processed and written down.
-            slam: after it.
+            frame: the last frame, processed and in the run folder.
+            slam: its state after the frame.
         """
         self._last = index, frame
         if self._every and self._folder.num_frames % self._every == 0:
             self._save(slam)
 
     def at_stop(self, slam: Slam) -> None:
-        """Save what came after the last checkpoint."""
+        """Saves a checkpoint if frames came after the last one."""
         if self._every and self._saved < self._folder.num_frames:
             self._save(slam)
 
@@ -66,19 +80,20 @@ class CheckpointWriter:
             self._checkpoints.save(slam.state(), progress)
             self._saved = self._folder.num_frames
         except OSError as error:
-            self._say(f'no checkpoint after frame {index}: {self._folder.path / CHECKPOINTS}: {error.strerror}; going on')
+            path = self._folder.path / CHECKPOINTS
+            self._say(f'no checkpoint after frame {index}: {path}: {error.strerror}; the run continues')
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResumedRun:
-    """A run that goes on.
+    """A run that continues.
 
     Attributes:
-        folder: with the lines of the frames before the checkpoint, and no others.
+        folder: holds the frames before the checkpoint, and no others.
         settings: of the run.
-        slam: as it was.
+        slam: its state after the frames before the checkpoint.
         sequence: the recording.
-        first: index of the next frame in it.
+        first: index of the next frame in the recording.
     """
 
     folder: RunFolder
@@ -92,17 +107,17 @@ def resume(
     path: Path, open_source: Callable[[Source], FrameSequence], begin: Callable[[SlamConfig], None],
     say: Callable[[str], None], device: str | None = None,
 ) -> ResumedRun:  # fmt: skip
-    """Make ready to go on with a run.
+    """Makes a run ready to continue from its newest checkpoint.
 
     Args:
-        path: its folder.
+        path: the run folder.
         open_source: opens a recording.
-        begin: told the settings before anything is computed.
-        say: tells the user.
-        device: where to go on; None = as the run's settings say.
+        begin: called with the run's settings before anything is computed.
+        say: shows a message to the user.
+        device: where to continue; None = as the run's settings say.
 
     Raises:
-        SplatamError: it cannot go on to the same result; nothing is changed then.
+        SplatamError: the run cannot continue to the same result; nothing is changed then.
     """
     settings = read_settings(path)
     settings = replace(settings, config=computed_on(settings.config, device))
@@ -115,15 +130,14 @@ def resume(
     _check_frames(sequence, checkpoint)
     _restore(slam, checkpoint)
     if settings.commit != (commit := provenance.commit()):
-        say(f'{path} was begun by commit {settings.commit} and goes on by {commit}: the result may differ from either')
-    trim_run(path, checkpoint.progress.num_lines, checkpoint.state.last_stamp_ns)
-    folder = RunFolder(path, read_run(path).frames)
+        say(f'commit {settings.commit} began {path}, and commit {commit} continues it: the result may differ from both')
+    folder = RunFolder.reopen(path, checkpoint.progress.num_lines, checkpoint.state.last_stamp_ns)
     folder.note_resumption(settings.config)
     return ResumedRun(folder, settings, slam, sequence, checkpoint.progress.last_index + 1)
 
 
 def frame_digest(frame: RgbdFrame) -> str:
-    """SHA-256 of a frame's stamp and images, hexadecimal."""
+    """Returns the SHA-256 of a frame's stamp and images, hexadecimal."""
     digest = hashlib.sha256(str(frame.stamp_ns).encode())
     for image in (frame.rgb, frame.depth_m):
         digest.update(image.tobytes())
@@ -135,13 +149,13 @@ def _check_settings(settings: RunSettings, checkpoint: Checkpoint) -> None:
     if differing := [name for name in now if now[name] != before[name] and name not in WHERE]:
         listed = ', '.join(f'{name} = {now[name]} (was {before[name]})' for name in differing[:3])
         raise CheckpointError(
-            f'{settings.path / "config.yaml"} is not what {checkpoint.path.name} was made with: {listed}; '
+            f'{settings.path / CONFIG} differs from the settings of {checkpoint.path.name}: {listed}; '
             'set it back, or begin another run with these settings'
         )
 
 
 def _check_frames(sequence: FrameSequence, checkpoint: Checkpoint) -> None:
-    """Make sure that the recording is the one the run began with, as far as one frame tells."""
+    """Checks that the recording is the one that the run began with, as far as its last processed frame shows."""
     progress, camera = checkpoint.progress, checkpoint.state.camera
     if len(sequence) != progress.length:
         what = f'has {len(sequence)} frames; it had {progress.length}'
@@ -152,7 +166,7 @@ def _check_frames(sequence: FrameSequence, checkpoint: Checkpoint) -> None:
     else:
         return
     raise CheckpointError(
-        f'{sequence.name} {what} when {checkpoint.path} was written; put the recording back, or run anew with --out DIR'
+        f'{sequence.name} {what} when {checkpoint.path} was written; restore the recording, or start a new run with --out DIR'
     )
 
 
@@ -160,4 +174,6 @@ def _restore(slam: Slam, checkpoint: Checkpoint) -> None:
     try:
         slam.restore(checkpoint.state)
     except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f'{checkpoint.path}: does not fit its own settings: {error}') from None
+        raise CheckpointError(
+            f'{checkpoint.path}: does not fit its own settings: {error}; use the version that wrote it, or start a new run'
+        ) from None

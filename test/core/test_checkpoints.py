@@ -30,9 +30,9 @@ from splatam_core.config import load_config
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.errors import CheckpointError
 from splatam_core.runs import checkpoints, resume
-from splatam_core.runs.archive import Content, seal, unseal
+from splatam_core.runs.archive import Content, pack, read_archive
 from splatam_core.runs.checkpoints import Checkpoints, Progress, checkpoint_paths, read_checkpoint, read_newest
-from splatam_core.runs.run_folder import read_run
+from splatam_core.runs.record import read_run
 from splatam_core.slam import Slam
 from splatam_core.state import SlamState
 
@@ -113,7 +113,7 @@ def killed_after(frames: int, words: list[str]) -> None:
     code = """
         import os, signal, sys
         from splatam_core import cli
-        from splatam_core.runs.run_folder import RunFolder
+        from splatam_core.runs.writer import RunFolder
 
         append = RunFolder.append
 
@@ -175,7 +175,7 @@ def test_ctrl_c_saves_a_checkpoint_of_the_last_frame(
     with monkeypatch.context() as patch:
         patch.setattr(resume.CheckpointWriter, 'after_frame', interrupted)
         assert splatam(*arguments('quick', tmp_path / 'run', '--checkpoint-every', EVERY)) == cli.EXIT_INTERRUPTED
-    assert f"'splatam run --resume {tmp_path / 'run'}' goes on" in capsys.readouterr().err
+    assert f"'splatam run --resume {tmp_path / 'run'}' continues" in capsys.readouterr().err
     assert read_newest(tmp_path / 'run' / 'checkpoints').progress.num_lines == 4
     assert splatam('run', '--resume', tmp_path / 'run', '--no-evaluate') == 0
     assert result(tmp_path / 'run') == result(whole['quick'])
@@ -362,7 +362,7 @@ def test_a_disk_that_is_full_does_not_stop_slam(
     monkeypatch.setattr(Checkpoints, 'save', save_where_little_fits)
     assert splatam(*arguments('quick', tmp_path / 'run', '--checkpoint-every', 1)) == 0
     said = [line for line in capsys.readouterr().err.splitlines() if 'no checkpoint after frame' in line]
-    assert len(said) == FRAMES - 2 and all('File too large; going on' in line for line in said)
+    assert len(said) == FRAMES - 2 and all('File too large; the run continues' in line for line in said)
     assert result(tmp_path / 'run') == result(whole['quick'])
     assert len(checkpoint_paths(tmp_path / 'run' / 'checkpoints')) == 2  # once there was room
     assert not list((tmp_path / 'run').rglob('.*'))
@@ -416,7 +416,7 @@ def test_damaged_keyframes_are_refused(damage: str, run: Path, capsys: pytest.Ca
     elif damage == 'changed':
         path.write_bytes(data[:-9] + bytes([data[-9] ^ 1]) + data[-8:])
     else:
-        seal('keyframe', 1, Content({}, {'rgb8': np.zeros(3)})).write(path)
+        pack('keyframe', 1, Content({}, {'rgb8': np.zeros(3)})).write(path)
     expected = {'missing': 'No such file', 'of another run': 'not the file that belongs here'}.get(damage, 'is damaged')
     line = refused(run, capsys)
     assert path.name in line and expected in line and 'move 000006.checkpoint away' in line
@@ -425,7 +425,7 @@ def test_damaged_keyframes_are_refused(damage: str, run: Path, capsys: pytest.Ca
 def test_the_error_shows_a_way_out_that_works(run: Path, whole: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
     newest = run / 'checkpoints' / '000006.checkpoint'
     newest.write_bytes(newest.read_bytes()[:-100])
-    assert 'move 000006.checkpoint away to go on from 000003.checkpoint' in refused(run, capsys)
+    assert 'move 000006.checkpoint away to resume from 000003.checkpoint' in refused(run, capsys)
     newest.rename(newest.with_suffix('.damaged'))
     assert splatam('run', '--resume', run, '--no-evaluate') == 0
     assert result(run) == result(whole['quick'])
@@ -441,7 +441,7 @@ class Executes:
         return Path.touch, (self.path,)
 
 
-def sealed(payload: bytes, header: str = 'splatam_ros checkpoint 1') -> bytes:
+def archived(payload: bytes, header: str = 'splatam_ros checkpoint 1') -> bytes:
     return f'{header} {hashlib.sha256(payload).hexdigest()}\n'.encode() + payload
 
 
@@ -452,7 +452,7 @@ def test_nothing_in_a_checkpoint_is_executed(run: Path, tmp_path: Path, capsys: 
     bare = io.BytesIO()
     np.save(bare, np.array([Executes(trap)], dtype=object), allow_pickle=True)
     for payload in (objects.getvalue(), bare.getvalue(), pickle.dumps(Executes(trap))):
-        newest.write_bytes(sealed(payload))
+        newest.write_bytes(archived(payload))
         assert 'something else than arrays of numbers' in refused(run, capsys)
     newest.write_bytes(pickle.dumps(Executes(trap)))
     assert 'is no checkpoint of splatam_ros' in refused(run, capsys)
@@ -464,20 +464,20 @@ def test_nothing_in_a_checkpoint_is_executed(run: Path, tmp_path: Path, capsys: 
 def test_other_files_are_refused(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     newest = run / 'checkpoints' / '000006.checkpoint'
     payload = newest.read_bytes().split(b'\n', 1)[1]
-    newest.write_bytes(sealed(payload, 'splatam_ros checkpoint 2'))
+    newest.write_bytes(archived(payload, 'splatam_ros checkpoint 2'))
     assert "is of format '2' and this version reads format 1" in refused(run, capsys)
     newest.write_bytes(next((run / 'checkpoints' / 'keyframes').iterdir()).read_bytes())
     assert 'is no checkpoint of splatam_ros' in refused(run, capsys)
     newest.write_bytes(b'\x89PNG\r\n\x1a\n' + bytes(100))
     assert r"begins with b'\x89PNG\r" in refused(run, capsys)
-    newest.write_bytes(sealed(b''))
+    newest.write_bytes(archived(b''))
     assert 'something else than arrays' in refused(run, capsys)
 
 
-def test_sealed_but_senseless_content_is_refused(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_whole_archives_of_senseless_content_are_refused(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Whoever computes the checksum may write what they like; it must still be a checkpoint."""
     newest = run / 'checkpoints' / '000006.checkpoint'
-    content = unseal(newest, 'checkpoint', 1)
+    content = read_archive(newest, 'checkpoint', 1)
     for values, arrays in (
         ({'rng': {}}, {}),
         ({'rng': {'bit_generator': 'PCG64', 'state': 3}}, {}),
@@ -490,7 +490,7 @@ def test_sealed_but_senseless_content_is_refused(run: Path, capsys: pytest.Captu
         ({}, {'map.means': np.zeros((3, 3))}),
         ({}, {'map.steps': content.arrays['map.steps'].astype(np.float32)}),
     ):
-        seal('checkpoint', 1, Content({**content.values, **values}, {**content.arrays, **arrays})).write(newest)
+        pack('checkpoint', 1, Content({**content.values, **values}, {**content.arrays, **arrays})).write(newest)
         assert '000006.checkpoint' in refused(run, capsys) or 'keyframe' in refused(run, capsys)
 
 
@@ -535,23 +535,23 @@ def test_what_cannot_be_resumed_is_said(
     assert 'leave out SOURCE, --max-frames, --out' in refused(run, capsys, 'synthetic', '--max-frames', 3, '--out', run)
     with pytest.raises(SystemExit):
         splatam('run', 'synthetic')
-    assert '--out DIR, or --resume DIR' in capsys.readouterr().err
+    assert '--out DIR to begin a run, or --resume DIR' in capsys.readouterr().err
     information = json.loads((run / 'run.json').read_text())
     (run / 'run.json').write_text(json.dumps(information | {'source': None}))
     assert 'live topics' in refused(run, capsys)
 
 
 def test_other_code_is_said(run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(resume.environment, 'commit', lambda: 'another')
+    monkeypatch.setattr(resume.provenance, 'commit', lambda: 'another')
     assert splatam('run', '--resume', run, '--no-evaluate') == 0
-    assert 'goes on by another: the result may differ' in capsys.readouterr().err
+    assert 'commit another continues it: the result may differ' in capsys.readouterr().err
 
 
-def test_a_sealed_file_is_the_same_whenever_it_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_archive_is_the_same_whenever_it_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
     content = Content({'a': 1.5}, {'b': np.arange(3)})
-    first = seal('checkpoint', 1, content)
+    first = pack('checkpoint', 1, content)
     monkeypatch.setattr(time, 'localtime', lambda *_: time.gmtime(2e9))  # an archive has dates
-    again = seal('checkpoint', 1, content)
+    again = pack('checkpoint', 1, content)
     assert (first.header, bytes(first.payload)) == (again.header, bytes(again.payload))
 
 

@@ -22,7 +22,8 @@ from splatam_core.config import load_config
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.geometry.trajectory import pose_line, stamp_text
 from splatam_core.maps.ply import read_ply
-from splatam_core.runs.run_folder import RunDescription, RunFolder, Source, read_run
+from splatam_core.runs.record import RunDescription, Source, read_run
+from splatam_core.runs.writer import RunFolder
 from splatam_core.slam import Slam
 from splatam_core.types import FrameResult, RgbdFrame
 
@@ -221,7 +222,7 @@ def test_damaged_recording_keeps_what_was_done(tmp_path: Path, capsys: pytest.Ca
     (tmp_path / 'tum' / 'rgb' / '2.png').write_bytes(b'not an image')
     assert splatam('run', tmp_path / 'tum', *SETTINGS, '--out', tmp_path / 'run') == 2
     error = capsys.readouterr().err
-    assert '2.png' in error and 'what was done before the error is in' in error
+    assert '2.png' in error and 'the results up to the error are in' in error
     m = metrics(tmp_path / 'run')
     assert m['frames'] == 2 and m['num_gaussians'] == len(read_ply(tmp_path / 'run' / 'map.ply').means)
     # The two frames before the damage can still be scored.
@@ -233,7 +234,7 @@ def test_a_frame_of_another_size_is_left_out(tmp_path: Path, capsys: pytest.Capt
     write_tum(tmp_path / 'tum')
     cv2.imwrite(str(tmp_path / 'tum' / 'rgb' / '1.png'), np.zeros((10, 10, 3), np.uint8))
     assert splatam('run', tmp_path / 'tum', *SETTINGS, '--no-evaluate', '--out', tmp_path / 'run') == 0
-    assert 'frame 1 is left out: ' in capsys.readouterr().err
+    assert 'frame 1 is skipped: ' in capsys.readouterr().err
     assert metrics(tmp_path / 'run')['frames'] == FRAMES - 1
 
 
@@ -301,7 +302,7 @@ def test_the_steps_after_the_last_frame_are_counted_and_are_not_of_a_run_that_wa
 ) -> None:
     few = ['--preset', 'realtime', '--width', WIDTH, '--max-frames', 6, '--no-evaluate']
     assert splatam('run', SOURCE, *few, '--out', tmp_path / 'run') == 0
-    assert 'fitting the map to all keyframes once more' in capsys.readouterr().err
+    assert 'now the final passes over the keyframes' in capsys.readouterr().err
     m, frames = metrics(tmp_path / 'run'), read_run(tmp_path / 'run').frames
     in_frames_s = sum(frame.process_ms for frame in frames) / 1e3
     assert m['finish_s'] > 0 and 6 / m['fps'] == pytest.approx(in_frames_s + m['finish_s'], abs=6e-4)  # of whole ms
@@ -314,7 +315,7 @@ def test_the_steps_after_the_last_frame_are_counted_and_are_not_of_a_run_that_wa
 
     monkeypatch.setattr(Slam, 'process', interrupted)
     assert splatam('run', SOURCE, *few, '--out', tmp_path / 'stopped') == 130
-    assert 'once more' not in capsys.readouterr().err and metrics(tmp_path / 'stopped')['finish_s'] == 0
+    assert 'final passes' not in capsys.readouterr().err and metrics(tmp_path / 'stopped')['finish_s'] == 0
 
 
 def test_ctrl_c_while_the_map_is_fitted_once_more_saves_it(
@@ -331,7 +332,7 @@ def test_ctrl_c_while_the_map_is_fitted_once_more_saves_it(
     few = ['--preset', 'realtime', '--width', WIDTH, '--max-frames', 6]
     assert splatam('run', SOURCE, *few, '--out', tmp_path / 'run') == 130
     said = capsys.readouterr().err
-    assert 'stopping where the map is by now' in said and 'stopped while the map was fitted once more' in said
+    assert 'stopping after this step of the final passes' in said and 'stopped during the final passes' in said
     assert steps == [0] and metrics(tmp_path / 'run')['frames'] == 6 and (tmp_path / 'run' / 'map.ply').is_file()
     assert splatam('evaluate', tmp_path / 'run') == 0
 

@@ -21,7 +21,7 @@ from splatam_core.geometry.trajectory import pose_line
 from splatam_core.maps.ply import read_ply
 from splatam_core.rasterizer import make_rasterizer
 from splatam_core.runs.metrics import Metrics
-from splatam_core.runs.run_folder import RunRecord, Source, read_run
+from splatam_core.runs.record import RunRecord, Source, read_run
 
 WIDTH, FRAMES, HOLD_OUT = 64, 6, 3
 SOURCE = ['synthetic', '--width', WIDTH, '--max-frames', FRAMES]
@@ -93,7 +93,7 @@ def replica_v2(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_test_split_is_scored_at_its_true_poses(replica_v2: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert splatam('run', replica_v2, '--preset', 'quick', *FAST, '--no-evaluate', '--out', tmp_path / 'run') == 0
     assert splatam('evaluate', tmp_path / 'run', '--novel-views') == 0
-    assert '1 views without holes, 1 with apart' in capsys.readouterr().out
+    assert '1 views without holes; 1 with holes are scored apart' in capsys.readouterr().out
     scores = metrics(tmp_path / 'run')
     assert (scores.novel_alignment, scores.novel_frames, scores.novel_holes_frames) == ('trajectory', 1, 1)
     # The view without holes is a train frame's: it scores about as that does; the other sees mostly what was not mapped.
@@ -147,12 +147,12 @@ def test_compare_refuses_what_it_cannot_draw(
 def test_bench_runs_presets_and_compares_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def here(command: list[str], check: bool) -> subprocess.CompletedProcess[str]:
+    def here(command: list[str], stdout: object, check: bool) -> subprocess.CompletedProcess[str]:
         """In this process: loading the libraries takes longer than such a run."""
-        assert command[:3] == [sys.executable, '-m', 'splatam_core.cli'] and not check
+        assert command[:3] == [sys.executable, '-m', 'splatam_core.cli'] and stdout is None and not check
         return subprocess.CompletedProcess(command, main(command[3:]))
 
-    monkeypatch.setattr('splatam_core.commands.bench.subprocess', SimpleNamespace(run=here))
+    monkeypatch.setattr('splatam_core.commands.shared.subprocess', SimpleNamespace(run=here))
     few = ['synthetic', '--width', 32, '--start', 1, '--max-frames', 3, *FAST]
     assert splatam('bench', *few, '--presets', 'quick,realtime', '--out', tmp_path / 'b') == 0
     rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith(('| quick', '| realtime'))]

@@ -28,8 +28,10 @@ from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.trajectory import Trajectory, stamp_from_text
 from splatam_core.maps.ply import write_ply
 from splatam_core.rasterizer import Gaussians, make_rasterizer
+from splatam_core.runs.layout import MAP
 from splatam_core.runs.metrics import GROUPS, Metrics, OriginalScores
-from splatam_core.runs.run_folder import MAP, RunDescription, RunFolder, RunRecord, Source, read_run
+from splatam_core.runs.record import RunDescription, RunRecord, Source, read_run
+from splatam_core.runs.writer import RunFolder
 from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status
 
 CONFIG = load_config('quick', ['threads=1'])

@@ -20,8 +20,9 @@ from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.maps.ply import read_ply
 from splatam_core.runs import provenance
-from splatam_core.runs.metrics import Metrics, StageStatistics
-from splatam_core.runs.run_folder import RunDescription, RunFolder, Source, read_run, run_metrics
+from splatam_core.runs.metrics import Metrics, StageStatistics, run_metrics
+from splatam_core.runs.record import RunDescription, Source, read_run
+from splatam_core.runs.writer import RunFolder
 from splatam_core.slam import Slam
 from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status
 

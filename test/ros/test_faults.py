@@ -17,7 +17,7 @@ from std_msgs.msg import Header
 from msg_adapters import stamps
 from splatam_core.datasets.synthetic import SyntheticSequence
 from splatam_core.maps.ply import read_ply
-from splatam_core.runs.run_folder import read_run
+from splatam_core.runs.record import read_run
 from splatam_core.types import RgbdFrame
 
 SECOND = 10**9

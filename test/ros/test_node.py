@@ -29,7 +29,7 @@ from splatam_core.config import load_config
 from splatam_core.datasets.convert import write_bag
 from splatam_core.datasets.synthetic import SyntheticSequence
 from splatam_core.maps.ply import read_ply
-from splatam_core.runs.run_folder import read_run
+from splatam_core.runs.record import read_run
 from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame
 

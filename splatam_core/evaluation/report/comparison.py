@@ -15,7 +15,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from splatam_core.evaluation.report import picture, plots
 from splatam_core.evaluation.report.descriptions import BY_NAME, Description
 from splatam_core.runs.metrics import Metrics
-from splatam_core.runs.run_folder import RunRecord
+from splatam_core.runs.record import RunRecord
 
 COLUMNS = (
     'ate_rmse_m', 'rpe_trans_frame_m', 'rpe_trans_1s_m', 'psnr_db', 'ssim', 'ms_ssim', 'lpips', 'depth_l1_m',

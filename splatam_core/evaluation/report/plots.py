@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from splatam_core.evaluation.score import Evaluation, Sample, TruthEvaluation
 from splatam_core.evaluation.trajectory import TrajectoryError
-from splatam_core.runs.metrics import STAGES
+from splatam_core.runs.frame_records import STAGES
 from splatam_core.types import Status
 
 INK, MUTED, FAINT = '#1b1f24', '#6b7480', '#e3e6ea'

@@ -1,0 +1,261 @@
+"""``splatam run``: SLAM over a recording, from its beginning or from a checkpoint."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import TYPE_CHECKING
+
+from splatam_core.commands.evaluate import print_summary, score_own_run
+from splatam_core.commands.shared import (
+    EXIT_INTERRUPTED,
+    Command,
+    add_device_argument,
+    add_preset_arguments,
+    add_source_arguments,
+    at_width,
+    open_source,
+    positive,
+    say,
+    source_of,
+)
+from splatam_core.errors import DatasetError, FrameError, RunFolderError, SplatamError
+
+if TYPE_CHECKING:
+    from splatam_core.config import SlamConfig
+    from splatam_core.datasets.base import Sequence as FrameSequence
+    from splatam_core.runs.metrics import Metrics
+    from splatam_core.runs.resume import CheckpointWriter
+    from splatam_core.runs.writer import RunFolder
+    from splatam_core.slam import Slam
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_source_arguments(parser, optional=True)
+    add_preset_arguments(parser)
+    add_device_argument(parser, 'device to compute on; same as --set device=D, and allowed with --resume')
+    parser.add_argument('--out', type=Path, metavar='DIR', help='folder for the results')
+    parser.add_argument('--overwrite', action='store_true', help='replace the run in DIR')
+    parser.add_argument(
+        '--holdout', type=positive, metavar='N',
+        help='track every n-th frame but keep it out of the map, and score it apart; same as --set mapping.hold_out=N',
+    )  # fmt: skip
+    parser.add_argument(
+        '--checkpoint-every', type=positive, metavar='N', help='save a checkpoint after every n-th frame, for --resume'
+    )
+    parser.add_argument('--keep-checkpoints', type=positive, metavar='K', help='keep the last K checkpoints only (default: 2)')
+    parser.add_argument(
+        '--resume', type=Path, metavar='DIR',
+        help='continue the run in DIR from its last checkpoint; the result is that of an uninterrupted run',
+    )  # fmt: skip
+    parser.add_argument('--no-evaluate', action='store_true', help='skip the scores of trajectory and images, and the report')
+    parser.set_defaults(parser=parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Runs SLAM over a recording, and scores the run. Returns the exit code."""
+    from splatam_core.runs.record import read_run
+
+    job = _begin(args) if args.resume is None else _resume(args)
+    path = job.folder.path
+    outcome = _process_and_save(job)
+    if outcome.failure is not None:
+        say(f'the results up to the error are in {path}{_resume_hint(path)}')
+        raise outcome.failure
+    if outcome.stopped:
+        say(f'stopped {outcome.stopped}; the results so far are in {path}{_resume_hint(path)}')
+        say(f"'splatam evaluate {path}' scores them")
+        return EXIT_INTERRUPTED
+    metrics = outcome.metrics
+    if metrics.frames == 0:
+        raise RunFolderError(f'{job.sequence.name}: none of its {len(job.sequence)} frames could be used; see above')
+    if not args.no_evaluate:
+        metrics = score_own_run(read_run(path), job.sequence)
+    print_summary(metrics, path)
+    return 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Job:
+    """A run that is ready to begin or to continue.
+
+    Attributes:
+        sequence: the recording.
+        first: index of the first frame to process.
+        slam: its state before that frame.
+        folder: holds the frames before that frame.
+        checkpoints: saves checkpoints.
+    """
+
+    sequence: FrameSequence
+    first: int
+    slam: Slam
+    folder: RunFolder
+    checkpoints: CheckpointWriter
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Outcome:
+    """How processing ended.
+
+    Attributes:
+        metrics: of the frames that were processed.
+        failure: the error that ended it; None if there was none.
+        stopped: where Ctrl-C ended it, for the user; empty if it did not.
+    """
+
+    metrics: Metrics
+    failure: DatasetError | None
+    stopped: str
+
+
+def _begin(args: argparse.Namespace) -> _Job:
+    from splatam_core.config import apply_threads
+    from splatam_core.runs.record import KEEP_CHECKPOINTS, RunDescription
+    from splatam_core.runs.resume import CheckpointWriter, prepare
+    from splatam_core.runs.writer import RunFolder
+
+    if args.source is None or args.out is None:
+        args.parser.error('give SOURCE and --out DIR to begin a run, or --resume DIR to continue one')
+    config = _config(args)
+    apply_threads(config)
+    source = at_width(source_of(args), config)
+    sequence, slam = prepare(open_source(source), config)
+    _say_backend(slam)
+    every, keep = args.checkpoint_every, args.keep_checkpoints or KEEP_CHECKPOINTS
+    description = RunDescription('splatam run', args.preset, source, every, keep)
+    folder = RunFolder.create(args.out, config, description, overwrite=args.overwrite)
+    return _Job(sequence, 0, slam, folder, CheckpointWriter(folder, len(sequence), every, keep, say))
+
+
+def _config(args: argparse.Namespace) -> SlamConfig:
+    from splatam_core.config import load_config
+
+    given = {'mapping.hold_out': args.holdout, 'device': args.device}
+    return load_config(args.preset, [*args.set, *(f'{name}={value}' for name, value in given.items() if value)])
+
+
+def _resume(args: argparse.Namespace) -> _Job:
+    from splatam_core.config import apply_threads
+    from splatam_core.runs.resume import CheckpointWriter, resume
+
+    _check_nothing_else_is_given(args)
+    run = resume(args.resume, open_source, apply_threads, say, args.device)
+    _say_backend(run.slam)
+    description = run.settings.description
+    every = args.checkpoint_every or description.checkpoint_every
+    keep = args.keep_checkpoints or description.keep_checkpoints
+    say(f'continuing {args.resume} at frame {run.first} of {len(run.sequence)}')
+    writer = CheckpointWriter(run.folder, len(run.sequence), every, keep, say)
+    return _Job(run.sequence, run.first, run.slam, run.folder, writer)
+
+
+def _say_backend(slam: Slam) -> None:
+    if slam.backend.why:
+        say(str(slam.backend))
+
+
+def _check_nothing_else_is_given(args: argparse.Namespace) -> None:
+    """Checks that no argument contradicts the settings of the run to resume."""
+    allowed = {'resume', 'run', 'parser', 'checkpoint_every', 'keep_checkpoints', 'no_evaluate', 'device'}
+    given = [name for name, value in vars(args).items() if name not in allowed and value != args.parser.get_default(name)]
+    if given:
+        names = ', '.join('SOURCE' if name == 'source' else '--' + name.replace('_', '-') for name in given)
+        raise SplatamError(f'--resume takes source and settings from the folder: leave out {names}')
+
+
+def _resume_hint(path: Path) -> str:
+    from splatam_core.runs.checkpoints import checkpoint_paths
+    from splatam_core.runs.layout import CHECKPOINTS
+
+    return f"; 'splatam run --resume {path}' continues" if checkpoint_paths(path / CHECKPOINTS) else ''
+
+
+class _StopRequest:
+    """Turns Ctrl-C into a request to stop after the frame or step at hand; a second Ctrl-C interrupts at once.
+
+    Attributes:
+        requested: True once Ctrl-C was pressed.
+        when: when the run will stop, for the user.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self.when = 'after this frame'
+
+    def __enter__(self) -> _StopRequest:
+        self._previous = signal.signal(signal.SIGINT, self._request)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        signal.signal(signal.SIGINT, self._previous)
+
+    def _request(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        say(f'stopping {self.when}; Ctrl-C again stops at once, without saving the map')
+
+
+def _process_and_save(job: _Job) -> _Outcome:
+    """Processes the frames, and saves map and metrics, also after an error or Ctrl-C.
+
+    Raises:
+        RunFolderError: the folder cannot be written.
+    """
+    path, length = job.folder.path, len(job.sequence)
+    try:
+        with job.folder, _StopRequest() as stop:
+            failure = _process(job, stop)
+            is_whole = failure is None and not stop.requested
+            if not is_whole:
+                job.checkpoints.at_stop(job.slam)
+            finish_s = _finish(job, stop) if is_whole else 0.0
+            metrics = job.folder.finish(job.slam, finish_s)
+    except OSError as error:
+        raise RunFolderError(f'{path}: cannot be written: {error.strerror}; free some space{_resume_hint(path)}') from None
+    where = 'during the final passes over the keyframes' if is_whole else f'after {metrics.frames} of {length} frames'
+    return _Outcome(metrics, failure, where if stop.requested else '')
+
+
+def _process(job: _Job, stop: _StopRequest) -> DatasetError | None:
+    """Processes frame after frame, to the end or to a stop request. Returns the error that ended the recording, if any."""
+    from tqdm import tqdm
+
+    tracked = lost = 0
+    length = len(job.sequence)
+    with tqdm(range(job.first, length), initial=job.first, total=length, unit='frame', dynamic_ncols=True) as bar:
+        for index in bar:
+            if stop.requested:
+                break
+            started_s = time.perf_counter()
+            try:
+                frame = job.sequence[index]
+                decoded_s = time.perf_counter()
+                result = job.slam.process(frame)
+            except FrameError as error:
+                say(f'frame {index} is skipped: {error}')
+                continue
+            except DatasetError as error:
+                return error
+            job.folder.append(frame, result, time.perf_counter() - decoded_s, decoded_s - started_s)
+            job.checkpoints.after_frame(index, frame, job.slam)
+            tracked, lost = tracked + (result.T_world_cam is not None), lost + (result.T_world_cam is None)
+            bar.set_postfix(tracked=tracked, lost=lost, gaussians=result.num_gaussians, refresh=False)
+    return None
+
+
+def _finish(job: _Job, stop: _StopRequest) -> float:
+    """Makes the final passes over the keyframes, if the settings ask for them. Returns the wall time, seconds."""
+    stop.when = 'after this step of the final passes'
+    if job.slam.config.mapping.fused.final_passes:
+        say('all frames are processed; now the final passes over the keyframes (mapping.fused.final_passes)')
+    begin_s = time.perf_counter()
+    job.slam.finish(stop=lambda: stop.requested)
+    return time.perf_counter() - begin_s
+
+
+COMMAND = Command('run', 'run SLAM over a recording', _add_arguments, run)

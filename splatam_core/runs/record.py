@@ -1,0 +1,228 @@
+"""A run folder read back: its settings, poses, frames and map."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatam_core.config import SlamConfig, load_config
+from splatam_core.errors import RunFolderError, SplatamError
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.geometry.trajectory import Trajectory, read_trajectory
+from splatam_core.maps.ply import read_ply
+from splatam_core.rasterizer import Gaussians
+from splatam_core.runs.frame_records import FrameRecord, read_frame_records, read_lost
+from splatam_core.runs.layout import CONFIG, FRAMES, MAP, METRICS, RUN, TRAJECTORY
+from splatam_core.runs.metrics import Metrics, run_metrics
+
+KEEP_CHECKPOINTS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A recording and how it was read: the arguments of ``open_sequence``.
+
+    Attributes:
+        path: dataset folder, bag, or ``synthetic:...``; absolute where it is a path.
+        format: name of the reader; None = guessed.
+        start: number of frames skipped at the beginning.
+        max_frames: largest number of frames read; None = all.
+        width: of the frames in pixels; None = as recorded.
+        rgb: colour topic of a bag; None = found by type.
+        depth: depth topic.
+        info: camera info topic.
+        stride: every n-th frame was read.
+        crop: pixels cut off each edge of the frames.
+        split: train or test, where a dataset has both.
+        skip_bad: True if frames that the dataset flags as bad were skipped.
+    """
+
+    path: str
+    format: str | None = None
+    start: int = 0
+    max_frames: int | None = None
+    width: int | None = None
+    rgb: str | None = None
+    depth: str | None = None
+    info: str | None = None
+    stride: int = 1
+    crop: int = 0
+    split: str | None = None
+    skip_bad: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class RunDescription:
+    """Where a run comes from.
+
+    Attributes:
+        program: what wrote it: ``splatam run``, ``splatam refine`` or ``splatam_node``.
+        preset: the preset it started from; None = the defaults.
+        source: the recording; None = live topics.
+        checkpoint_every: frames from one checkpoint to the next; None = no checkpoints.
+        keep_checkpoints: number of checkpoints to keep.
+    """
+
+    program: str
+    preset: str | None = None
+    source: Source | None = None
+    checkpoint_every: int | None = None
+    keep_checkpoints: int = KEEP_CHECKPOINTS
+
+
+@dataclass(frozen=True, slots=True)
+class RunSettings:
+    """What is written when a run begins.
+
+    Attributes:
+        path: the folder.
+        config: every setting.
+        description: where the run comes from.
+        camera: of the frames; None where no frame was processed.
+        commit: of the code; None where unknown.
+        machine: facts about the computer, by name.
+        versions: of the libraries, by name; None = not installed.
+    """
+
+    path: Path
+    config: SlamConfig
+    description: RunDescription
+    camera: PinholeCamera | None
+    commit: str | None
+    machine: Mapping[str, str | int | None]
+    versions: Mapping[str, str | None]
+
+
+@dataclass(frozen=True, slots=True)
+class RunRecord(RunSettings):
+    """A whole run folder.
+
+    Attributes:
+        trajectory: the tracked frames.
+        lost_ns: stamps of the lost frames.
+        frames: one record per frame; empty where there is no ``frames.csv``.
+    """
+
+    trajectory: Trajectory
+    lost_ns: tuple[int, ...]
+    frames: tuple[FrameRecord, ...]
+
+    def stamps_ns(self) -> list[int]:
+        """Returns the stamps of all frames in order, lost ones included: the n-th is the one of frame n of the run."""
+        return sorted([*map(int, self.trajectory.stamps_ns), *self.lost_ns])
+
+    def poses(self) -> dict[int, NDArray[np.float64]]:
+        """Returns T_world_cam [4, 4] of the tracked frames, by stamp."""
+        return dict(zip(map(int, self.trajectory.stamps_ns), self.trajectory.T_world_cam))
+
+    def mapped_poses(self) -> dict[int, NDArray[np.float64]]:
+        """Returns the poses of the frames that were not held out of the map, by stamp."""
+        is_held_out = self.config.mapping.is_held_out
+        held_out = {stamp_ns for index, stamp_ns in enumerate(self.stamps_ns()) if is_held_out(index)}
+        return {stamp_ns: pose for stamp_ns, pose in self.poses().items() if stamp_ns not in held_out}
+
+    def read_map(self) -> Gaussians:
+        """Reads the map.
+
+        Raises:
+            RunFolderError: there is none.
+            MapFileError: it cannot be read.
+        """
+        if not (self.path / MAP).is_file():
+            raise RunFolderError(f'{self.path} has no {MAP}: the run ended before it could be saved')
+        return read_ply(self.path / MAP)
+
+    def camera_or_error(self) -> PinholeCamera:
+        """Returns the camera of the frames.
+
+        Raises:
+            RunFolderError: no frame was processed.
+        """
+        if self.camera is None:
+            raise RunFolderError(f'{self.path} has no camera: no frame was processed')
+        return self.camera
+
+    def metrics(self) -> Metrics:
+        """Returns the run's metrics; where it was killed before it wrote them, those that follow from its frames.
+
+        Raises:
+            RunFolderError: ``metrics.json`` is damaged.
+        """
+        path = self.path / METRICS
+        if not path.exists():
+            return run_metrics(self.frames)
+        try:
+            return Metrics.from_json(path.read_text())
+        except RunFolderError as error:
+            raise RunFolderError(f'{self.path}: {error}') from None
+
+
+def read_settings(path: Path) -> RunSettings:
+    """Reads what was written when a run began. Settings of earlier versions get their present names.
+
+    Raises:
+        RunFolderError: the path is no run folder, or one of its files is damaged.
+    """
+    with read_errors(path):
+        information = json.loads((path / RUN).read_text())
+        source, camera = information['source'], information['camera']
+        return RunSettings(
+            path=path,
+            config=load_config(str(path / CONFIG)),
+            description=RunDescription(
+                program=information['program'],
+                preset=information['preset'],
+                source=None if source is None else Source(**source),
+                checkpoint_every=information.get('checkpoint_every'),
+                keep_checkpoints=information.get('keep_checkpoints', KEEP_CHECKPOINTS),
+            ),
+            camera=None if camera is None else PinholeCamera(**camera),
+            commit=information['commit'],
+            machine=information['machine'],
+            versions=information['versions'],
+        )
+
+
+def read_run(path: Path) -> RunRecord:
+    """Reads a run folder.
+
+    Raises:
+        RunFolderError: the path is no run folder, or one of its files is damaged.
+    """
+    settings = read_settings(path)
+    with read_errors(path):
+        return RunRecord(
+            path=path,
+            config=settings.config,
+            description=settings.description,
+            camera=settings.camera,
+            commit=settings.commit,
+            machine=settings.machine,
+            versions=settings.versions,
+            trajectory=read_trajectory(path / TRAJECTORY),
+            lost_ns=read_lost(path / TRAJECTORY),
+            frames=read_frame_records(path / FRAMES),
+        )
+
+
+@contextmanager
+def read_errors(path: Path) -> Iterator[None]:
+    """Turns every error that a missing or damaged file of a run folder causes into one line.
+
+    Raises:
+        RunFolderError: the path is no run folder, or the block raised such an error.
+    """
+    if missing := [name for name in (TRAJECTORY, CONFIG, RUN) if not (path / name).is_file()]:
+        raise RunFolderError(f'{path} is no run folder: it has no {", ".join(missing)}')
+    try:
+        yield
+    except SplatamError as error:
+        raise RunFolderError(f'{path} cannot be read: {error}') from None
+    except (OSError, KeyError, TypeError, ValueError, IndexError) as error:
+        raise RunFolderError(f'{path} cannot be read: {error!r}; if another version wrote it, read it with that version') from None
