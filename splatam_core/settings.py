@@ -44,13 +44,16 @@ class Setting:
         """
         if self.type is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
-        if type(value) is not self.type or (self.choices and value not in self.choices):
+        if not isinstance(value, Value) or type(value) is not self.type or (self.choices and value not in self.choices):
             raise ConfigError(f'{self.name} = {value!r}: expected {self._allowed()}')
-        too_low = self.minimum is not None and not value >= self.minimum
-        too_high = self.maximum is not None and not value <= self.maximum
-        if too_low or too_high:
+        if not isinstance(value, str) and not self._contains(value):
             raise ConfigError(f'{self.name} = {value}: expected {self._allowed()}')
         return value
+
+    def _contains(self, number: float) -> bool:
+        """False for NaN, too, where there is a bound."""
+        is_high_enough = self.minimum is None or number >= self.minimum
+        return is_high_enough and (self.maximum is None or number <= self.maximum)
 
     def _allowed(self) -> str:
         if self.choices:
@@ -82,7 +85,8 @@ def settings_of(section: type, prefix: str = '') -> Iterator[Setting]:
         if is_dataclass(hints[entry.name]):
             yield from settings_of(hints[entry.name], f'{prefix}{entry.name}.')
         else:
-            yield Setting(f'{prefix}{entry.name}', hints[entry.name], entry.default, **entry.metadata)
+            default: Any = entry.default  # every setting has one
+            yield Setting(f'{prefix}{entry.name}', hints[entry.name], default, **entry.metadata)
 
 
 def leaf(section: object, name: str) -> Value:

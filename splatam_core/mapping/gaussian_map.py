@@ -1,4 +1,4 @@
-"""The map: what its Gaussians are, and the optimiser that refines them."""
+"""The map: the Gaussians, and the Adam optimizer that refines them by autograd."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ BOUNDS = 'bounds'
 class GaussianMap:
     """Gaussians in world coordinates, all isotropic or all anisotropic, on one device.
 
-    Only ``append`` and ``keep`` change how many there are; ``keep`` takes the optimiser's moments along. There is room for
-    more than there are, so that a growing map is not copied each time.
+    Only ``append``, ``extend``, ``keep`` and ``restore`` change how many there are; ``keep`` keeps the optimizer's moments in
+    step. Tensors have spare capacity, so that a growing map is not copied each time.
 
     Attributes:
         means: [N, 3] metres.
         log_scales: [N, 1] log metres; [N, 3] when anisotropic.
         logit_opacities: [N].
         rgb: [N, 3], nominally in [0, 1].
-        rotations: [N, 4] as ``Gaussians`` has them; None when isotropic.
+        rotations: [N, 4] see ``Gaussians``; None when isotropic.
     """
 
     means: Tensor
@@ -44,18 +44,18 @@ class GaussianMap:
     def __init__(self, anisotropic: bool = False, device: torch.device = HOST) -> None:
         self._size = 0
         self._names = (*PARAMETERS, ROTATIONS) if anisotropic else PARAMETERS
-        self._room = {
+        self._storage = {
             'means': torch.empty(0, 3), 'log_scales': torch.empty(0, 3 if anisotropic else 1),
             'logit_opacities': torch.empty(0), 'rgb': torch.empty(0, 3),
             'first_second': torch.empty(0, 16), 'steps': torch.empty(0, dtype=torch.uint8),
         }  # fmt: skip
         if anisotropic:
-            self._room[ROTATIONS] = torch.empty(0, 4)
-        self._room = {name: values.to(device) for name, values in self._room.items()}
+            self._storage[ROTATIONS] = torch.empty(0, 4)
+        self._storage = {name: values.to(device) for name, values in self._storage.items()}
         self.rotations = None
         self._bounds = torch.empty(0, 7, device=device)
         self._optimizer: torch.optim.Adam | None = None
-        self._show()
+        self._refresh_views()
 
     def __len__(self) -> int:
         return self._size
@@ -63,55 +63,55 @@ class GaussianMap:
     @property
     def is_anisotropic(self) -> bool:
         """Whether its Gaussians have three radii and a rotation."""
-        return ROTATIONS in self._room
+        return ROTATIONS in self._storage
 
     @property
     def gaussians(self) -> Gaussians:
-        """The parameters themselves, as a rasterizer takes them; they carry gradients while being optimised."""
+        """The parameters themselves, not a copy; they carry gradients during an optimization."""
         bounds = self._bounds if self._optimizer is None else None
         return Gaussians(self.means, self.log_scales, self.logit_opacities, self.rgb, bounds, self.rotations)
 
     @property
     def moments(self) -> Moments:
-        """Of the steps that a rasterizer takes itself (``Rasterizer.fit``); they live as long as their Gaussians."""
-        return Moments(self._room['first_second'][: self._size], self._room['steps'][: self._size])
+        """Adam moments of the fused optimizer (``Rasterizer.fit``); they live as long as their Gaussians."""
+        return Moments(self._storage['first_second'][: self._size], self._storage['steps'][: self._size])
 
     def append(self, new: Gaussians) -> None:
-        """Add Gaussians. Ends an optimisation that was under way.
+        """Adds Gaussians. Ends an optimization in progress.
 
         Raises:
-            RasterizerError: anisotropic ones, to an isotropic map.
+            RasterizerError: the new Gaussians are anisotropic and the map is not.
         """
         new = self._of_its_kind(new)
         self.stop_optimization()
         old_size, self._size = self._size, self._size + len(new)
-        self._make_room()
+        self._reserve()
         for name in ('first_second', 'steps'):
-            self._room[name][old_size : self._size] = 0
-        self._show()
+            self._storage[name][old_size : self._size] = 0
+        self._refresh_views()
         self.replace_last(new)
 
     def replace_last(self, new: Gaussians) -> None:
-        """Put others in the place of as many that were added last; what has been moved since is not for this.
+        """Replaces the Gaussians that were added last by as many others. Nothing may have moved since then.
 
         Raises:
-            RasterizerError: anisotropic ones, to an isotropic map.
+            RasterizerError: the new Gaussians are anisotropic and the map is not.
         """
         assert self._optimizer is None
         new, begin = self._of_its_kind(new), self._size - len(new)
         for name in self._names:
-            self._room[name][begin : self._size] = getattr(new, name)
-        self._measure(begin // BLOCK)
+            self._storage[name][begin : self._size] = getattr(new, name)
+        self._update_bounds(begin // BLOCK)
 
     def keep(self, kept: Tensor) -> None:
-        """Drop all Gaussians but those where ``kept`` [N] is true; gradients and moments of the others stay."""
+        """Drops all Gaussians but those where ``kept`` [N] is true; these keep their gradients and moments."""
         old = {name: getattr(self, name) for name in self._names}
         kept = torch.nonzero(kept)[:, 0]
         size, self._size = self._size, len(kept)
-        for values in self._room.values():
+        for values in self._storage.values():
             values[: self._size] = values[:size].index_select(0, kept)
-        self._show()
-        self._measure(0)
+        self._refresh_views()
+        self._update_bounds(0)
         if self._optimizer is not None:
             for name in self._names:
                 new = getattr(self, name).requires_grad_()
@@ -119,28 +119,28 @@ class GaussianMap:
                 _replace_parameter(self._optimizer, old[name], new, kept)
 
     def start_optimization(self, rates: Rates) -> None:
-        """Begin with fresh moments, as the paper does for every frame."""
-        self._show()
+        """Begins an optimization with fresh moments, as the paper does for every frame."""
+        self._refresh_views()
         groups = [{'params': [getattr(self, name).requires_grad_()], 'lr': getattr(rates, name)} for name in self._names]
         self._optimizer = torch.optim.Adam(groups, betas=(BETA_1, BETA_2), eps=EPSILON, fused=True)
 
     def set_rates(self, rates: Rates) -> None:
-        """Go on with other step sizes."""
+        """Changes the step sizes of the optimization in progress."""
         assert self._optimizer is not None
         for group, name in zip(self._optimizer.param_groups, self._names):
             group['lr'] = getattr(rates, name)
 
     def step(self) -> None:
-        """Move along the gradients collected since the last step."""
+        """Takes one optimizer step along the gradients, and clears them."""
         assert self._optimizer is not None
         self._optimizer.step()
         self._optimizer.zero_grad(set_to_none=True)
 
     def extend(self, new: Gaussians) -> None:
-        """Add Gaussians to an optimisation under way; moments of the others stay, gradients go.
+        """Adds Gaussians during an optimization. The others keep their moments and lose their gradients.
 
         Raises:
-            RasterizerError: anisotropic ones, to an isotropic map.
+            RasterizerError: the new Gaussians are anisotropic and the map is not.
         """
         assert self._optimizer is not None
         rates = Rates(**{name: group['lr'] for name, group in zip(self._names, self._optimizer.param_groups)})
@@ -152,7 +152,7 @@ class GaussianMap:
                 self._optimizer.state[getattr(self, name)] = {key: _padded(value, len(new)) for key, value in state.items()}
 
     def set_opacities(self, opacity: float) -> None:
-        """Give all the same opacity, in (0, 1); what their logits' gradients and moments have collected is forgotten."""
+        """Sets every opacity to one value in (0, 1); clears the gradients and moments of the opacity logits."""
         logits = self.logit_opacities
         with torch.no_grad():
             logits.fill_(math.log(opacity / (1 - opacity)))
@@ -162,14 +162,14 @@ class GaussianMap:
                 state[name].zero_()
 
     def stop_optimization(self) -> None:
-        """Cut the parameters off from autograd."""
+        """Ends the optimization: detaches the parameters from autograd."""
         if self._optimizer is not None:
             self._optimizer = None
-            self._show()
-            self._measure(0)
+            self._refresh_views()
+            self._update_bounds(0)
 
     def snapshot(self) -> MapSnapshot:
-        """A copy that later changes of the map leave alone."""
+        """Returns a copy; later changes of the map do not affect it."""
         with torch.no_grad():
             return MapSnapshot(
                 _host_copy(self.means),
@@ -180,29 +180,29 @@ class GaussianMap:
             )
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """A copy of all it holds between two optimisations, by name; ``restore`` takes it back, on whichever device."""
+        """Returns a copy of everything the map holds between two optimizations, by name; ``restore`` takes it on any device."""
         assert self._optimizer is None
-        arrays = {name: _host_copy(values[: self._size]) for name, values in self._room.items()}
+        arrays = {name: _host_copy(values[: self._size]) for name, values in self._storage.items()}
         return arrays | {BOUNDS: _host_copy(self._bounds)}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Hold what another map held, instead of what is here.
+        """Replaces the content by that of another map.
 
         Raises:
-            ValueError: the arrays are not those of a map of this kind.
+            ValueError: the arrays do not fit this kind of map.
         """
         size = len(arrays['means']) if 'means' in arrays else 0
-        room = {name: values.new_empty(size, *values.shape[1:]) for name, values in self._room.items()}
+        capacity = {name: values.new_empty(size, *values.shape[1:]) for name, values in self._storage.items()}
         bounds = self._bounds.new_empty(-(-size // BLOCK), *self._bounds.shape[1:])
-        expected = room | {BOUNDS: bounds}
+        expected = capacity | {BOUNDS: bounds}
         found = {name: (array.dtype.name, array.shape) for name, array in sorted(arrays.items())}
         wanted = {name: (str(v.dtype).removeprefix('torch.'), tuple(v.shape)) for name, v in sorted(expected.items())}
         if found != wanted:
             raise ValueError(f'the map is {found}; expected {wanted}')
         for name, values in expected.items():
             values.copy_(torch.from_numpy(arrays[name]))
-        self._size, self._room, self._bounds, self._optimizer = size, room, bounds, None
-        self._show()
+        self._size, self._storage, self._bounds, self._optimizer = size, capacity, bounds, None
+        self._refresh_views()
 
     def _of_its_kind(self, new: Gaussians) -> Gaussians:
         if self.is_anisotropic:
@@ -210,22 +210,22 @@ class GaussianMap:
         check_isotropic(new)
         return new
 
-    def _show(self) -> None:
-        """Let the parameters be the used part of the room, without gradients."""
+    def _refresh_views(self) -> None:
+        """Makes the parameters views of the used part of the capacity, without gradients."""
         for name in self._names:
-            setattr(self, name, self._room[name][: self._size])
+            setattr(self, name, self._storage[name][: self._size])
 
-    def _make_room(self) -> None:
-        if self._size <= len(self._room['means']):
+    def _reserve(self) -> None:
+        if self._size <= len(self._storage['means']):
             return
-        room = self._size + self._size // 2
-        for name, old in self._room.items():
-            new = old.new_empty(room, *old.shape[1:])
+        capacity = self._size + self._size // 2
+        for name, old in self._storage.items():
+            new = old.new_empty(capacity, *old.shape[1:])
             new[: len(old)] = old
-            self._room[name] = new
+            self._storage[name] = new
 
-    def _measure(self, first_block: int) -> None:
-        """Find the bounds of the blocks from one on."""
+    def _update_bounds(self, first_block: int) -> None:
+        """Recomputes the bounds of all blocks from ``first_block`` on."""
         begin = first_block * BLOCK
         if self._size <= begin:
             self._bounds = self._bounds[:first_block]
@@ -239,7 +239,7 @@ def _host_copy(values: Tensor) -> NDArray[Any]:
 
 
 def _padded(value: Tensor, count: int) -> Tensor:
-    """Moments with zeros for so many new Gaussians; what is none, a count of steps, as it is."""
+    """Returns moments extended by zeros for new Gaussians; a step count is returned as it is."""
     return torch.cat([value, value.new_zeros(count, *value.shape[1:])]) if value.ndim else value
 
 

@@ -1,4 +1,4 @@
-"""Which views are kept, and which are mapped together: some keyframes, the last keyframe, the current view."""
+"""Keyframes: which are kept, and which are mapped together with the current view (paper, section 3.4)."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.images.view import unproject
 from splatam_core.mapping.posed import PosedView
 
-_TOGETHER = 64  # keyframes whose overlap is found at once: more would not stay in a core's cache
+_BATCH = 64  # keyframes whose overlap is computed at once; more would not fit a core's cache
 
 
 class KeyframeStore(Sequence[PosedView]):
-    """Keyframes, in the host's memory; copies of those used last are on the device.
+    """All keyframes, in the host's memory, with copies of the recently used ones on the device.
 
     Attributes:
-        config: how many there may be, and how many of them on the device.
+        config: the largest number of keyframes, and of copies on the device.
     """
 
     def __init__(self, device: torch.device, config: KeyframeConfig) -> None:
         self.config = config
         self._device = device
         self._kept: list[PosedView] = []
-        self._copies: dict[PosedView, PosedView] = {}  # the last used is the last
+        self._copies: dict[PosedView, PosedView] = {}  # ordered by last use
 
     def __len__(self) -> int:
         return len(self._kept)
 
     def __getitem__(self, index: Any) -> Any:
-        """As they are kept."""
+        """Returns keyframes in the host's memory."""
         return self._kept[index]
 
     def append(self, keyframe: PosedView, copy: PosedView | None = None) -> None:
-        """Keep one more, in place of the least needed where there are as many as may be.
+        """Keeps one more keyframe; drops the least needed one beyond the budget.
 
         Args:
             keyframe: in the host's memory.
-            copy: the same on the device, if it is there.
+            copy: the same on the device, if it exists already.
         """
         self._kept.append(keyframe)
         while 0 < self.config.budget < len(self._kept):
@@ -53,7 +53,7 @@ class KeyframeStore(Sequence[PosedView]):
             self._remember(keyframe, copy)
 
     def on_device(self, keyframe: PosedView) -> PosedView:
-        """A view on the device; brought there unless it is."""
+        """Returns a keyframe on the device; copies it there if necessary."""
         if keyframe.view.depth.device == self._device:
             return keyframe.bare()
         copy = self._copies.pop(keyframe, None) or keyframe.to(self._device)
@@ -61,7 +61,7 @@ class KeyframeStore(Sequence[PosedView]):
         return copy
 
     def window(self, views: Sequence[PosedView]) -> Window:
-        """Views, each brought to the device when it is taken."""
+        """Returns views as a window, each of which is copied to the device when it is used."""
         return Window(views, self)
 
     def _remember(self, keyframe: PosedView, copy: PosedView) -> None:
@@ -71,9 +71,9 @@ class KeyframeStore(Sequence[PosedView]):
 
 
 def least_needed(keyframes: Sequence[PosedView]) -> int:
-    """Which to let go: the one whose neighbours in time are nearest to each other, not the first or last of three or more.
+    """Returns the keyframe to drop: the one whose neighbours in time are nearest to each other; never the first or the last.
 
-    Near: few metres and radians apart; what is a metre away moves as far in the image by the one as by the other.
+    The distance adds metres and radians: both move a point at one metre equally far in the image.
     """
     if len(keyframes) < 3:
         return 0
@@ -86,7 +86,7 @@ def least_needed(keyframes: Sequence[PosedView]) -> int:
 
 
 class Window(Sequence[PosedView]):
-    """Views to map; only those that are taken from it need be on the device."""
+    """Views that are mapped together; the current one is the last. Each is copied to the device when it is used."""
 
     def __init__(self, views: Sequence[PosedView], store: KeyframeStore) -> None:
         self._views, self._store = views, store
@@ -95,16 +95,17 @@ class Window(Sequence[PosedView]):
         return len(self._views)
 
     def __getitem__(self, index: Any) -> Any:
-        """One view, on the device."""
+        """Returns one view, on the device."""
         return self._store.on_device(self._views[index])
 
 
 def select_keyframes(
     current: PosedView, keyframes: Sequence[PosedView], config: KeyframeConfig, rng: np.random.Generator
 ) -> list[PosedView]:
-    """Those to map with the current view: some by the configured selection, and the last. All in the host's memory.
+    """Returns the keyframes to map with the current view: some by the configured selection, and the last. All in host memory.
 
-    By default random ones that overlap, not the best: those are nearly the current view, and the map would forget the rest.
+    The default draws at random among those that overlap. The best overlaps are nearly the current view, and fitting only
+    these would make the map forget the rest.
     """
     if not keyframes or config.window == 1:
         return []
@@ -160,9 +161,9 @@ def _seen(
 
 
 def sample_points(posed: PosedView, count: int, rng: np.random.Generator) -> Tensor:
-    """[count, 3] world points of random pixels with a reading, drawn with replacement; none where none has one."""
+    """Returns [count, 3] world points of random pixels with a reading, drawn with replacement; [0, 3] without any."""
     depth = posed.view.depth
-    with_reading = np.flatnonzero(posed.view.valid.numpy())  # eight times as fast as torch's
+    with_reading = np.flatnonzero(posed.view.valid.numpy())  # eight times as fast as torch.nonzero
     if len(with_reading) == 0:
         return depth.new_empty(0, 3)
     drawn = torch.from_numpy(with_reading[rng.integers(len(with_reading), size=count)])
@@ -172,15 +173,17 @@ def sample_points(posed: PosedView, count: int, rng: np.random.Generator) -> Ten
 
 
 def overlaps(points: Tensor, camera: PinholeCamera, keyframes: Sequence[PosedView], margin: int) -> list[float]:
-    """Share of world points [K, 3] that the camera, where each view was taken, has more than ``margin`` pixels inside."""
+    """Returns, for each keyframe, the fraction of world points [K, 3] that it sees at least ``margin`` pixels inside its image."""
     if not len(points) or not keyframes:
         return [0.0] * len(keyframes)
     T = torch.stack([keyframe.T_cam_world for keyframe in keyframes])[:, :3]  # [N, 3, 4]
     shares = torch.zeros(len(T))
-    near = _may_see(points, camera, T).nonzero()[:, 0]  # of a long way, few
+    near = _may_see(points, camera, T).nonzero()[:, 0]  # on a long path only a few
     homogeneous = torch.cat([points.T, points.new_ones(1, len(points))])  # [4, K]
-    for chosen in near.split(_TOGETHER):
-        x, y, z = (T[chosen].reshape(-1, 4) @ homogeneous).view(len(chosen), 3, -1).unbind(1)  # [N, K] each, by one product
+    for chosen in near.split(_BATCH):
+        x, y, z = (
+            (T[chosen].reshape(-1, 4) @ homogeneous).view(len(chosen), 3, -1).unbind(1)
+        )  # [N, K] each, from one matrix product
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         inside = (u > margin) & (u < camera.width - margin) & (v > margin) & (v < camera.height - margin) & (z > 0)
         shares[chosen] = inside.float().mean(dim=1)
@@ -188,9 +191,9 @@ def overlaps(points: Tensor, camera: PinholeCamera, keyframes: Sequence[PosedVie
 
 
 def _may_see(points: Tensor, camera: PinholeCamera, T_cam_world: Tensor) -> Tensor:
-    """[N] false where a sphere about the points is behind the camera at [N, 3, 4], or beyond an edge of its image."""
+    """Returns [N] False where a sphere around the points is behind the camera at [N, 3, 4], or outside its image."""
     centre = points.mean(dim=0)
-    radius = 1.001 * float((points - centre).norm(dim=1).max()) + 1e-3  # what rounding might do is seen
+    radius = 1.001 * float((points - centre).norm(dim=1).max()) + 1e-3  # a margin for rounding
     x, y, z = (T_cam_world[:, :, :3] @ centre + T_cam_world[:, :, 3]).unbind(1)
     seen = z > -radius
     for across, focal, pixels in (
@@ -210,7 +213,7 @@ def views_to_fit(window: Sequence[PosedView], num_steps: int, config: SlamConfig
 
 
 def draw(window: Sequence[PosedView], config: KeyframeConfig, rng: np.random.Generator) -> PosedView:
-    """One view of a window, whose last is the current one."""
+    """Returns a random view of a window; ``current_share`` of the draws give the current one, which is the last."""
     if config.current_share == 0 or len(window) == 1:
-        return window[rng.integers(len(window))]
-    return window[-1] if rng.random() < config.current_share else window[rng.integers(len(window) - 1)]
+        return window[int(rng.integers(len(window)))]
+    return window[-1] if rng.random() < config.current_share else window[int(rng.integers(len(window) - 1))]

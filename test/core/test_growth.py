@@ -1,4 +1,4 @@
-"""Where a map grows: the pull against finite differences, clones and splits by hand."""
+"""Adaptive density control: the screen-space gradient against finite differences, clones and splits by hand."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from splatam_core.device import HOST
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
-from splatam_core.mapping.adaptive_density import PULL, SHRINK, ScreenPull, grow
+from splatam_core.mapping.adaptive_density import GRADIENT_THRESHOLD, SHRINK, ScreenSpaceGradient, clone_and_split
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.rasterizer import Gaussians, Rates, make_rasterizer
 
@@ -31,7 +31,7 @@ def _gaussians(count: int, anisotropic: bool = False) -> Gaussians:
     return Gaussians((in_camera - t) @ R, log_scales, torch.zeros(count), rgb, None, rotations)
 
 
-def test_pull_is_the_slope_of_the_loss_by_the_place_in_the_image() -> None:
+def test_screen_space_gradient_is_the_derivative_by_the_position_in_the_image() -> None:
     """Central differences, to a per cent of the largest: so much float32 renders resolve.
 
     The Gaussians are so wide that none is cut off within the image, which would let the loss jump.
@@ -45,8 +45,8 @@ def test_pull_is_the_slope_of_the_loss_by_the_place_in_the_image() -> None:
 
     means = g.means.clone().requires_grad_()
     loss(means).backward()
-    pull = ScreenPull(5, HOST)
-    pull.observe(means.grad, g.means, CAMERA, T_CAM_WORLD)
+    gradient = ScreenSpaceGradient(5, HOST)
+    gradient.observe(means.grad, g.means, CAMERA, T_CAM_WORLD)
     expected = torch.zeros(5, 2)
     z = (g.means @ T_CAM_WORLD[:3, :3].T + T_CAM_WORLD[:3, 3])[:, 2]
     for index in range(5):
@@ -57,18 +57,18 @@ def test_pull_is_the_slope_of_the_loss_by_the_place_in_the_image() -> None:
             plus[index] += offset
             minus[index] -= offset
             expected[index, axis] = (loss(plus) - loss(minus)) / (2 * step) * size / 2
-    torch.testing.assert_close(pull.mean(), expected.norm(dim=1), atol=0.01 * float(expected.max()), rtol=0.02)
+    torch.testing.assert_close(gradient.mean(), expected.norm(dim=1), atol=0.01 * float(expected.max()), rtol=0.02)
 
 
-def test_pull_is_averaged_over_the_views_that_drew_it() -> None:
-    pull, means = ScreenPull(3, HOST), torch.tensor([[0.0, 0.0, 1.0]]).repeat(3, 1)
-    slopes = torch.tensor([[3.0, 0, 0], [1.0, 0, 0], [0.0, 0, 0]])
-    pull.observe(slopes, means, CAMERA, torch.eye(4))
-    pull.observe(slopes * torch.tensor([[1.0], [0.0], [0.0]]), means, CAMERA, torch.eye(4))
+def test_screen_space_gradient_is_the_mean_over_the_views_that_drew_a_gaussian() -> None:
+    gradient, means = ScreenSpaceGradient(3, HOST), torch.tensor([[0.0, 0.0, 1.0]]).repeat(3, 1)
+    gradients = torch.tensor([[3.0, 0, 0], [1.0, 0, 0], [0.0, 0, 0]])
+    gradient.observe(gradients, means, CAMERA, torch.eye(4))
+    gradient.observe(gradients * torch.tensor([[1.0], [0.0], [0.0]]), means, CAMERA, torch.eye(4))
     unit = CAMERA.width / 2 / CAMERA.fx
-    assert pull.mean().tolist() == pytest.approx([3 * unit, unit, 0.0])
-    pull.keep(torch.tensor([False, True, True]))
-    assert pull.mean().tolist() == pytest.approx([unit, 0.0])
+    assert gradient.mean().tolist() == pytest.approx([3 * unit, unit, 0.0])
+    gradient.keep(torch.tensor([False, True, True]))
+    assert gradient.mean().tolist() == pytest.approx([unit, 0.0])
 
 
 @pytest.mark.parametrize('anisotropic', [False, True])
@@ -80,11 +80,11 @@ def test_small_ones_are_cloned_and_large_ones_split(anisotropic: bool) -> None:
     gaussian_map.start_optimization(RATES)
     gaussian_map.means.grad = torch.ones_like(gaussian_map.means)
     gaussian_map.step()
-    pull = torch.zeros(60)
-    pull[10:50] = 2 * PULL  # ten small ones, thirty large ones
+    gradient = torch.zeros(60)
+    gradient[10:50] = 2 * GRADIENT_THRESHOLD  # ten small ones, thirty large ones
     before = gaussian_map.gaussians.detached()
     before = Gaussians(before.means.clone(), before.log_scales.clone(), before.logit_opacities, before.rgb)
-    grow(gaussian_map, pull, scene_radius=1.0, rng=np.random.default_rng(0))
+    clone_and_split(gaussian_map, gradient, scene_radius=1.0, rng=np.random.default_rng(0))
     now = gaussian_map.gaussians.detached()
     assert len(now) == 60 + 10 + 30
     staying = [*range(20), *range(50, 60)]
@@ -109,7 +109,7 @@ def test_a_split_goes_along_the_long_axis() -> None:
     gaussian_map.start_optimization(RATES)
     axes = torch.from_numpy(se3.rotation_from_quaternion(g.rotations.double().numpy())).float()[:, :, 0]
     parents = g.means.clone()
-    grow(gaussian_map, torch.full((40,), 1.0), scene_radius=1.0, rng=np.random.default_rng(1))
+    clone_and_split(gaussian_map, torch.full((40,), 1.0), scene_radius=1.0, rng=np.random.default_rng(1))
     offsets = gaussian_map.means.detach().view(2, 40, 3) - parents
     along = (offsets * axes).sum(dim=2)
     across = (offsets - along[..., None] * axes).norm(dim=2)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from splatam_core.config import MappingConfig
 from splatam_core.mapping.optimizers.base import MapOptimizer, TimeLimit, prunable, rates
 from splatam_core.mapping.optimizers.fused import FusedOptimizer
@@ -10,7 +12,7 @@ from splatam_core.rasterizer import Rasterizer
 
 __all__ = ['FusedOptimizer', 'MapOptimizer', 'PaperOptimizer', 'TimeLimit', 'make_optimizer', 'prunable', 'rates']
 
-_OPTIMIZERS = {'paper': PaperOptimizer, 'fused': FusedOptimizer}
+_OPTIMIZERS: dict[str, Callable[[Rasterizer, MappingConfig], MapOptimizer]] = {'paper': PaperOptimizer, 'fused': FusedOptimizer}
 
 
 def make_optimizer(rasterizer: Rasterizer, config: MappingConfig) -> MapOptimizer:
