@@ -1,1 +1,1 @@
-"""Maps as files: PLY, exports, videos."""
+"""Maps as files: PLY files, exports for other programs, images and videos along a path."""

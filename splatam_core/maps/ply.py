@@ -1,8 +1,8 @@
-"""Maps as files: the PLY layout that 3D Gaussian splatting viewers read.
+"""Maps as PLY files in the layout that 3D Gaussian splatting viewers read.
 
-One ``vertex`` element of little-endian floats per Gaussian: centre, unused normals, colour as the zeroth
-spherical-harmonics coefficient ``f_dc = (rgb - 0.5) / C0``, logit opacity, three log scales in metres and a
-quaternion w x y z. An isotropic Gaussian repeats its scale and does not rotate.
+Each Gaussian is one ``vertex`` element of little-endian floats: centre, unused normals, colour as the zeroth
+spherical-harmonics coefficient ``f_dc = (rgb - 0.5) / C0``, logit opacity, three log scales in log metres and a
+quaternion w x y z. An isotropic Gaussian repeats its scale and has the identity rotation.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NORMALS = ('nx', 'ny', 'nz')
 SCALES = ('scale_0', 'scale_1', 'scale_2')
 RGB = ('red', 'green', 'blue')
 ROTATION = ('rot_0', 'rot_1', 'rot_2', 'rot_3')
-NEEDED = ('x', 'y', 'z', 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', *SCALES)
+REQUIRED = ('x', 'y', 'z', 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', *SCALES)
 PROPERTIES = ('x', 'y', 'z', *NORMALS, 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', *SCALES, *ROTATION)
 
 COMMENTS = (
@@ -45,7 +45,7 @@ _MAX_HEADER_BYTES = 65536
 
 
 def write_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write a map; a file that is there is replaced once the new one is complete."""
+    """Write a map. An existing file is replaced only when the new one is complete."""
     columns = _columns(gaussians)
     rows = np.zeros(len(gaussians), dtype=[(name, '<f4') for name in PROPERTIES])
     for name, column in columns.items():
@@ -75,13 +75,13 @@ def _columns(gaussians: Gaussians) -> dict[str, NDArray[np.float64]]:
 def write_surface(
     path: Path, points_m: NDArray[np.floating], rgb: NDArray[np.floating], triangles: NDArray[np.integer] | None = None
 ) -> None:
-    """Write coloured points, or a mesh; a file that is there is replaced once the new one is complete.
+    """Write coloured points or a mesh. An existing file is replaced only when the new one is complete.
 
     Args:
-        path: the file.
+        path: the file to write.
         points_m: [N, 3].
-        rgb: [N, 3], clamped to [0, 1] here.
-        triangles: [M, 3] indices of points; None = points only.
+        rgb: [N, 3] colours; values outside [0, 1] are clamped.
+        triangles: [M, 3] indices of points; None writes points only.
     """
     vertices = np.zeros(len(points_m), dtype=[*((name, '<f4') for name in 'xyz'), *((name, 'u1') for name in RGB)])
     for axis, name in enumerate('xyz'):
@@ -103,16 +103,16 @@ def write_surface(
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Read a map; where each Gaussian's three scales are equal, as one of isotropic Gaussians.
+    """Read a map.
 
-    Higher spherical-harmonics coefficients (colour that depends on the direction) are left out.
+    Higher spherical-harmonics coefficients (view-dependent colour) are ignored.
 
     Returns:
-        float32 tensors.
+        float32 tensors. The map is isotropic if the three scales of every Gaussian are equal, else anisotropic.
 
     Raises:
-        MapFileError: the file cannot be read, is no such PLY, is cut short, or holds a number that is not finite,
-            or anisotropic Gaussians without rotations.
+        MapFileError: the file cannot be read, is not a PLY file in this layout, is cut short, holds a number that is
+            not finite, or holds anisotropic Gaussians without rotations.
     """
     try:
         with path.open('rb') as file:
@@ -123,7 +123,7 @@ def read_ply(path: Path) -> Gaussians:
     except ValueError as error:
         raise MapFileError(f'{path}: {error}') from None
     is_anisotropic = any((rows[SCALES[0]] != rows[other]).any() for other in SCALES[1:])
-    names = (*NEEDED, *(name for name in ROTATION if is_anisotropic and name in header.row.names))
+    names = [*REQUIRED, *(name for name in ROTATION if is_anisotropic and name in header.names)]
     values = {name: rows[name].astype(np.float32) for name in names}
     _check_values(path, values)
     if is_anisotropic:
@@ -139,8 +139,15 @@ def read_ply(path: Path) -> Gaussians:
 
 @dataclass(frozen=True, slots=True)
 class _Header:
+    """The number of Gaussians and the layout of one of them."""
+
     count: int
     row: np.dtype
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the properties."""
+        return self.row.names or ()
 
 
 def _read_header(file: BinaryIO) -> _Header:
@@ -149,7 +156,7 @@ def _read_header(file: BinaryIO) -> _Header:
     lines = []
     while (line := file.readline(_MAX_HEADER_BYTES)).rstrip() != b'end_header':
         if not line.endswith(b'\n') or file.tell() > _MAX_HEADER_BYTES:
-            raise ValueError("the header has no 'end_header': the file is damaged or no PLY")
+            raise ValueError("the header has no 'end_header': the file is damaged or is not a PLY file")
         lines.append(line.decode('ascii', errors='replace').split())
     return _parse_header([words for words in lines if words and words[0] not in ('comment', 'obj_info')])
 
@@ -157,46 +164,48 @@ def _read_header(file: BinaryIO) -> _Header:
 def _parse_header(lines: list[list[str]]) -> _Header:
     kind = ' '.join(lines[0]) if lines else ''
     if kind != 'format binary_little_endian 1.0':
-        raise ValueError(f"'{kind}': only format binary_little_endian 1.0 is read")
+        raise ValueError(f"'{kind}' is not supported: only format binary_little_endian 1.0 is read")
     if len(lines) < 2 or lines[1][:2] != ['element', 'vertex'] or len(lines[1]) != 3:
-        raise ValueError("the first element must be 'vertex', one per Gaussian")
+        raise ValueError("the first element must be 'vertex' (one vertex per Gaussian)")
     if not lines[1][2].isdecimal():
         raise ValueError(f"'{lines[1][2]}' is not a number of vertices")
     properties = []
     for words in lines[2:]:
-        if words[0] == 'element':  # faces and the like: they lie behind the vertices and do not matter
+        if words[0] == 'element':  # faces and the like follow the vertices and are not needed
             break
         if len(words) != 3 or words[0] != 'property' or words[1] not in _SCALAR_TYPES:
-            raise ValueError(f"header line '{' '.join(words)}' is no scalar property of a vertex")
+            raise ValueError(f"header line '{' '.join(words)}' is not a scalar property of a vertex")
         properties.append((words[2], '<' + _SCALAR_TYPES[words[1]]))
     names = [name for name, _ in properties]
-    if missing := [name for name in NEEDED if name not in names]:
-        raise ValueError(f'no property {", ".join(missing)}: not a map in the 3D Gaussian splatting layout')
-    return _Header(int(lines[1][2]), np.dtype(properties))  # a name given twice is a ValueError here
+    if missing := [name for name in REQUIRED if name not in names]:
+        raise ValueError(f'property {", ".join(missing)} is missing: this is not a map in the 3D Gaussian splatting layout')
+    return _Header(int(lines[1][2]), np.dtype(properties))  # a duplicate name raises ValueError here
 
 
 def _read_rows(file: BinaryIO, header: _Header) -> NDArray[np.void]:
     available = os.fstat(file.fileno()).st_size - file.tell()
     needed = header.count * header.row.itemsize
     if available < needed:
-        raise ValueError(f'{header.count} Gaussians take {needed} bytes, {available} are there: the file is cut short')
+        raise ValueError(
+            f'{header.count} Gaussians need {needed} bytes but only {available} follow the header: the file is cut short'
+        )
     return np.fromfile(file, dtype=header.row, count=header.count)
 
 
 def _check_values(path: Path, values: dict[str, NDArray[np.float32]]) -> None:
     finite = np.all([np.isfinite(column) for column in values.values()], axis=0)
     if not finite.all():
-        raise MapFileError(f'{path}: {int((~finite).sum())} of {len(finite)} Gaussians hold NaN or infinity')
+        raise MapFileError(f'{path}: {int((~finite).sum())} of {len(finite)} Gaussians contain NaN or infinity')
 
 
 def _check_rotations(path: Path, values: dict[str, NDArray[np.float32]]) -> None:
     if missing := [name for name in ROTATION if name not in values]:
         raise MapFileError(
-            f'{path}: scale_0, scale_1 and scale_2 differ, so rotations are needed; no property {", ".join(missing)}'
+            f'{path}: scale_0, scale_1 and scale_2 differ, so rotations are needed, but property {", ".join(missing)} is missing'
         )
-    without = ~np.any([values[name] for name in ROTATION], axis=0)
-    if without.any():
-        raise MapFileError(f'{path}: {int(without.sum())} of {len(without)} Gaussians have a quaternion of length zero')
+    is_zero = ~np.any([values[name] for name in ROTATION], axis=0)
+    if is_zero.any():
+        raise MapFileError(f'{path}: {int(is_zero.sum())} of {len(is_zero)} Gaussians have a quaternion of length zero')
 
 
 def _tensor(values: dict[str, NDArray[np.float32]], names: tuple[str, ...]) -> torch.Tensor:

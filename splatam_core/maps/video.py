@@ -1,4 +1,4 @@
-"""A map filmed along a path: pictures and videos of colour, depth and silhouette."""
+"""Renders of a map along a path: images and videos of colour, depth and silhouette."""
 
 from __future__ import annotations
 
@@ -39,30 +39,30 @@ def render_along(
     rate_hz: float | None,
     progress: Callable[[range], Iterable[int]],
 ) -> None:
-    """Write what a map looks like from each pose of a path.
+    """Render a map from each pose of a path and write the images and videos.
 
-    ::
+    The files written are::
 
         color/000000.png       8 bit RGB
         depth/000000.png       16 bit millimetres, expected depth; 0 = none
-        silhouette/000000.png  8 bit, 255 = all map
+        silhouette/000000.png  8 bit, 255 = fully covered by the map
         color.mp4 depth.mp4 silhouette.mp4  depth from near (yellow) to far (blue), black = none
 
     Args:
         gaussians: the map, on the rasterizer's device.
-        rasterizer: draws it.
-        camera: what it is seen through.
-        path: from where, in the map's world.
-        folder: exists and is empty.
-        images: whether to write the pictures.
-        rate_hz: of the videos; None = no videos.
-        progress: wraps the loop over the poses.
+        rasterizer: renders the map.
+        camera: the camera to render with.
+        path: the poses to render from, in the map's world.
+        folder: an existing empty folder.
+        images: True to write the images.
+        rate_hz: frame rate of the videos; None writes no videos.
+        progress: wraps the loop over the poses, to display progress.
 
     Raises:
-        RasterizerError: this OpenCV cannot write such videos.
+        RasterizerError: this OpenCV build cannot write the videos, or an image cannot be written.
     """
     map_only = gaussians.detached()
-    far_m: float | None = None  # of the first pose that sees anything: a scale that jumps would flicker
+    far_m: float | None = None  # one depth scale for the whole video, set by the first view that has depth: no flicker
     with ExitStack() as stack:
         films = {} if rate_hz is None else {kind: _film(stack, folder, kind, camera, rate_hz) for kind in KINDS}
         for kind in KINDS if images else ():
@@ -79,7 +79,7 @@ def render_along(
 
 
 def median_rate_hz(path: Trajectory) -> float:
-    """How fast the poses of a path follow each other, within what videos can do."""
+    """Return the median rate of a path's poses, limited to the frame rates that videos support."""
     if len(path) < 2:
         return MIN_RATE_HZ
     return float(np.clip(1e9 / np.median(np.diff(path.stamps_ns)), MIN_RATE_HZ, MAX_RATE_HZ))
@@ -90,29 +90,35 @@ def _film(stack: ExitStack, folder: Path, kind: str, camera: PinholeCamera, rate
     film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*CODEC), rate_hz, (camera.width, camera.height))
     stack.callback(film.release)
     if not film.isOpened():
-        raise RasterizerError(f'{path}: this OpenCV writes no {CODEC} videos; leave them out with --no-video')
+        raise RasterizerError(f'{path}: this OpenCV build cannot write {CODEC} videos; skip them with --no-video')
     return film
 
 
 def _film_picture(kind: str, view: RenderedView, far_m: float) -> Picture:
-    """[H, W, 3] as OpenCV's writer takes it, BGR."""
+    """Return the video frame [H, W, 3] in BGR, as OpenCV expects it."""
     if kind == 'color':
         return np.ascontiguousarray(view.rgb[..., ::-1])
     if kind == 'silhouette':
-        return cv2.cvtColor(_silhouette(view), cv2.COLOR_GRAY2BGR)
+        return np.repeat(_silhouette(view)[..., None], 3, axis=2)
     nearness = 1 - np.clip(view.depth_m / far_m, 0, 1)
-    colored = cv2.applyColorMap(np.uint8(np.rint(255 * nearness)), cv2.COLORMAP_VIRIDIS)
+    colored = np.asarray(cv2.applyColorMap(_to_bytes(nearness), cv2.COLORMAP_VIRIDIS), np.uint8)
     colored[view.depth_m == 0] = 0
     return colored
 
 
 def _write_images(folder: Path, index: int, view: RenderedView) -> None:
     depth = np.rint(np.clip(view.depth_m * DEPTH_COUNTS_PER_M, 0, MAX_COUNT)).astype(np.uint16)
-    for kind, picture in zip(KINDS, (view.rgb[..., ::-1], depth, _silhouette(view))):
+    pictures: dict[str, NDArray[np.integer]] = {'color': view.rgb[..., ::-1], 'depth': depth, 'silhouette': _silhouette(view)}
+    for kind, picture in pictures.items():
         path = folder / kind / f'{index:06d}.png'
         if not cv2.imwrite(str(path), picture):
             raise RasterizerError(f'{path}: cannot be written')
 
 
 def _silhouette(view: RenderedView) -> Picture:
-    return np.uint8(np.rint(255 * np.clip(view.silhouette, 0, 1)))
+    return _to_bytes(np.clip(view.silhouette, 0, 1))
+
+
+def _to_bytes(values: NDArray[np.floating]) -> Picture:
+    """Scale values in [0, 1] to 0..255."""
+    return np.rint(255 * values).astype(np.uint8)

@@ -1,7 +1,8 @@
-"""Map files: the layout viewers expect, exact round trips, and damaged files that say so."""
+"""Map files: the layout that viewers expect, exact round trips, files of 0.1.0, and clear errors for damaged files."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from splatam_core.errors import MapFileError
 from splatam_core.maps.ply import PROPERTIES, SH_C0, read_ply, write_ply
 from splatam_core.rasterizer.base import Gaussians
 
+FIXTURES = Path(__file__).parent / 'fixtures_0_1_0'
 STANDARD = [  # the order of the original 3D Gaussian splatting exporter, degree 0
     'x', 'y', 'z', 'nx', 'ny', 'nz', 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', 'scale_0', 'scale_1', 'scale_2',
     'rot_0', 'rot_1', 'rot_2', 'rot_3',
@@ -59,7 +61,7 @@ def test_layout_is_the_standard_one(tmp_path: Path) -> None:
 
 
 def other_map(path: Path, dtype: list[tuple[str, str]], rows: np.ndarray, header: str = '') -> None:
-    """A map file of another program."""
+    """Write a map file as another program would."""
     names = {'<f4': 'float', '<f8': 'double', '|u1': 'uchar'}
     properties = ''.join(f'property {names[np.dtype(kind).str]} {name}\n' for name, kind in dtype)
     head = f'ply\nformat binary_little_endian 1.0\n{header}element vertex {len(rows)}\n{properties}end_header\n'
@@ -77,6 +79,22 @@ def test_reads_maps_of_other_programs(tmp_path: Path) -> None:
     assert gaussians.means[:, 0].tolist() == [1, 2, 3]
     assert gaussians.rgb[0].tolist() == pytest.approx([0.5, 0.75, 0.5])
     assert gaussians.log_scales.tolist() == [[-5.0]] * 3
+
+
+@pytest.mark.parametrize('preset', ['realtime', 'splatam'])
+def test_maps_of_0_1_0_are_read_and_written_alike(tmp_path: Path, preset: str) -> None:
+    written_by_0_1_0 = FIXTURES / preset / 'map.ply'
+    gaussians = read_ply(written_by_0_1_0)
+    last = json.loads((FIXTURES / preset / 'metrics.json').read_text())['num_gaussians']
+    assert len(gaussians) == last and gaussians.rotations is None
+    write_ply(tmp_path / 'map.ply', gaussians)
+    again, before = split(tmp_path / 'map.ply'), split(written_by_0_1_0)
+    assert again[0] == before[0]
+    # Colour is read as rgb = f_dc * C0 + 0.5 in 32 bits, so its last bits may change; everything else is exact.
+    rows = [np.frombuffer(body, '<f4').reshape(-1, len(PROPERTIES)) for _, body in (again, before)]
+    is_color = np.char.startswith(np.array(PROPERTIES), 'f_dc')
+    np.testing.assert_array_equal(rows[0][:, ~is_color], rows[1][:, ~is_color])
+    np.testing.assert_allclose(rows[0][:, is_color], rows[1][:, is_color], atol=1e-6)
 
 
 def test_anisotropic_maps_keep_scales_and_rotations(tmp_path: Path) -> None:
@@ -97,7 +115,7 @@ def test_anisotropic_maps_need_rotations(tmp_path: Path) -> None:
     with pytest.raises(MapFileError, match='1 of 2 Gaussians have a quaternion of length zero'):
         read_ply(tmp_path / 'other.ply')
     other_map(tmp_path / 'other.ply', dtype[:-1], rows[[name for name, _ in dtype[:-1]]].astype(dtype[:-1]))
-    with pytest.raises(MapFileError, match='rotations are needed; no property rot_3'):
+    with pytest.raises(MapFileError, match='rotations are needed, but property rot_3 is missing'):
         read_ply(tmp_path / 'other.ply')
 
 
@@ -105,16 +123,16 @@ def test_anisotropic_maps_need_rotations(tmp_path: Path) -> None:
     ('old', 'new', 'message'),
     [
         (b'ply\n', b'PK\x03\x04', 'not a PLY file'),
-        (b'binary_little_endian', b'ascii', 'only format binary_little_endian 1.0 is read'),
+        (b'binary_little_endian', b'ascii', 'ascii 1.0.* is not supported: only format binary_little_endian 1.0 is read'),
         (b'element vertex 5', b'element face 5', "first element must be 'vertex'"),
         (b'element vertex 5', b'element vertex -5', "'-5' is not a number"),
         (b'element vertex 5', b'element vertex 6', 'cut short'),
         (b'element vertex 5', b'element vertex 999999999999999999', 'cut short'),
-        (b'property float opacity\n', b'', 'no property opacity'),
-        (b'property float nx', b'property list uchar int nx', 'no scalar property'),
-        (b'property float nx', b'property quad nx', 'no scalar property'),
+        (b'property float opacity\n', b'', 'property opacity is missing'),
+        (b'property float nx', b'property list uchar int nx', 'not a scalar property'),
+        (b'property float nx', b'property quad nx', 'not a scalar property'),
         (b'property float nx', b'property float x', 'more than once'),
-        (b'property float nx', b'\xff\xfe', 'no scalar property'),
+        (b'property float nx', b'\xff\xfe', 'not a scalar property'),
         (b'end_header\n', b'', 'end_header'),
     ],
 )
@@ -159,7 +177,7 @@ def test_not_finite_is_an_error(tmp_path: Path) -> None:
     gaussians = some_gaussians(4)
     gaussians.means[2, 1] = float('nan')
     write_ply(tmp_path / 'map.ply', gaussians)
-    with pytest.raises(MapFileError, match='1 of 4 Gaussians hold NaN'):
+    with pytest.raises(MapFileError, match='1 of 4 Gaussians contain NaN'):
         read_ply(tmp_path / 'map.ply')
 
 
