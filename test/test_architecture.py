@@ -1,11 +1,11 @@
-"""Who may import whom (docs: the layers are msg_adapters, splatam_core, splatam_ros), checked import by import."""
+"""Who may import whom: three packages, and the wings inside them, checked import by import; no import cycles."""
 
 from __future__ import annotations
 
 import ast
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,9 +14,9 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ('msg_adapters', 'splatam_core', 'splatam_ros')
 
-BAG_READER = 'splatam_core.datasets.rosbag'
+BAG_READER = 'splatam_core.datasets.bag'  # a package
 EXR_READER = 'splatam_core.datasets.files'
-TRITON = 'splatam_core.rasterizer.triton.rasterizer'  # and its kernels and lists, which only it imports
+TRITON = 'splatam_core.rasterizer.triton'  # a package
 OPTIONAL = {'lpips': 'splatam_core.evaluation.similarity', 'open3d': 'splatam_core.maps.export'}
 MESSAGES = {
     'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'rcl_interfaces', 'rosgraph_msgs',
@@ -32,6 +32,37 @@ MAY_IMPORT = {
 }  # fmt: skip
 THREADING = {'_thread', 'asyncio', 'concurrent', 'multiprocessing', 'threading'}
 MAY_THREAD = {'splatam_core.worker', 'splatam_ros.node.node', 'splatam_ros.player.read_ahead', 'splatam_ros.frames.buffer'}
+
+
+# Each wing and what it may import beside itself. What a wing may import, whatever stands above it may import, too.
+FLOORS: tuple[tuple[str, ...], ...] = (
+    ('splatam_core.errors', 'splatam_core.atomic_io'),
+    ('splatam_core.resources', 'splatam_core.settings', 'splatam_core.retired_settings'),
+    ('splatam_core.config',),
+    ('splatam_core.geometry',),
+    ('splatam_core.types',),
+    ('splatam_core.device',),
+    ('splatam_core.stopwatch', 'splatam_core.images'),
+    ('splatam_core.datasets',),
+    ('splatam_core._native',),
+    ('splatam_core.rasterizer',),
+    ('splatam_core.tracking', 'splatam_core.mapping'),
+    ('splatam_core.state',),
+    ('splatam_core.lifecycle',),
+    ('splatam_core.slam',),
+    ('splatam_core.worker', 'splatam_core.maps'),
+    ('splatam_core.runs',),
+    ('splatam_core.evaluation',),
+    ('splatam_core.evaluation.report',),
+    ('splatam_core.commands',),
+    ('splatam_core.cli',),
+    ('splatam_ros.process', 'splatam_ros.throttled_warnings', 'splatam_ros.interface', 'splatam_ros.cameras'),
+    ('splatam_ros.subscription',),
+    ('splatam_ros.frames', 'splatam_ros.player'),
+    ('splatam_ros.node',),
+    ('splatam_ros.entry', 'splatam_ros.demo', 'splatam_ros.launch'),
+)
+"""Wings from the ground up; wings of one floor do not import each other."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +134,7 @@ def breach(module: str, imported: Import) -> str | None:
         return None
     if package == 'msg_adapters' and imported.top in MESSAGES | {'rosbags'}:
         return None if imported.deferred else 'message classes are imported only where one is built'
-    if imported.top in ('msg_adapters', 'rosbags') and module == BAG_READER:
+    if imported.top in ('msg_adapters', 'rosbags') and is_inside(module, BAG_READER):
         return None
     if imported.top == 'OpenEXR' and module == EXR_READER:
         return None if imported.deferred else 'OpenEXR is optional: import it where it is needed'
@@ -119,8 +150,32 @@ def breaches(module: str, source: str, is_package: bool = False) -> Iterator[str
     finder = ImportFinder(module, is_package)
     finder.visit(ast.parse(source))
     for imported in finder.imports:
-        if why := breach(module, imported):
+        if why := breach(module, imported) or breach_of_floors(module, imported):
             yield f'{module}:{imported.line} imports {imported.name}: {why}'
+
+
+def is_inside(module: str, package: str) -> bool:
+    """Whether a module is a package, or in it."""
+    return module == package or module.startswith(package + '.')
+
+
+def wing_of(module: str) -> str | None:
+    """The innermost wing that a module is in; None for the packages' own ``__init__``."""
+    inside = [wing for floor in FLOORS for wing in floor if is_inside(module, wing)]
+    return max(inside, key=len, default=None)
+
+
+def floor_of(wing: str) -> int:
+    """The number of a wing's floor, from the ground up."""
+    return next(number for number, floor in enumerate(FLOORS) if wing in floor)
+
+
+def breach_of_floors(module: str, imported: Import) -> str | None:
+    """Why the module's wing may not import this, or None. What only type checkers see counts, too."""
+    wing, other = wing_of(module), wing_of(imported.name)
+    if wing is None or other is None or wing == other or floor_of(wing) > floor_of(other):
+        return None
+    return f'{wing} stands below or beside {other}'
 
 
 def source_files() -> list[Path]:
@@ -139,16 +194,70 @@ def test_every_import_keeps_to_its_layer() -> None:
     assert not found, '\n' + '\n'.join(found)
 
 
+def test_every_module_is_in_a_wing() -> None:
+    """Whoever adds a room says where it stands."""
+    packages = [*PACKAGES, 'splatam_core.commands']
+    modules = [module_name(path) for path in source_files() if not module_name(path).startswith('msg_adapters')]
+    assert [module for module in modules if wing_of(module) is None and module not in packages] == []
+
+
+def test_no_file_imports_itself_by_a_detour() -> None:
+    """Imports when the modules are loaded; inside a function an import breaks a cycle, but hides it."""
+    modules = {module_name(path): path for path in source_files()}
+    graph = {name: {target for target in targets(path, modules) if target != name} for name, path in modules.items()}
+    assert list(cycles(graph)) == []
+
+
+def targets(path: Path, modules: Mapping[str, Path]) -> set[str]:
+    """The modules of the packages that a file imports, inside functions too."""
+    finder = ImportFinder(module_name(path), path.name == '__init__.py')
+    finder.visit(ast.parse(path.read_text()))
+    names = {imported.name for imported in finder.imports}
+    return {name if name in modules else name.rpartition('.')[0] for name in names} & set(modules)
+
+
+def cycles(graph: Mapping[str, set[str]]) -> Iterator[list[str]]:
+    """Each cycle that a walk from every module closes first."""
+    done: set[str] = set()
+    for start in graph:
+        stack = [(start, iter(sorted(graph[start])))] if start not in done else []
+        on_path = [start] if stack else []
+        while stack:
+            name, following = stack[-1]
+            target = next((target for target in following if target not in done), None)
+            if target is None:
+                done.add(name)
+                on_path.pop()
+                stack.pop()
+            elif target in on_path:
+                yield [*on_path[on_path.index(target) :], target]
+            else:
+                on_path.append(target)
+                stack.append((target, iter(sorted(graph[target]))))
+
+
+def test_a_cycle_is_seen() -> None:
+    assert list(cycles({'a': {'b'}, 'b': {'c', 'd'}, 'c': {'a'}, 'd': set()})) == [['a', 'b', 'c', 'a']]
+    assert list(cycles({'a': {'b', 'c'}, 'b': {'d'}, 'c': {'d'}, 'd': set()})) == []
+
+
 @pytest.mark.parametrize(
     ('module', 'source'),
     [
+        ('splatam_core.geometry.camera', 'from splatam_core.images.view import View'),
+        ('splatam_core.mapping.mapper', 'from splatam_core.tracking.motion import MotionModel'),
+        ('splatam_core.tracking.base', 'if TYPE_CHECKING:\n    from splatam_core.slam import Slam'),
+        ('splatam_core.runs.record', 'def f():\n    from splatam_core.evaluation.score import score'),
+        ('splatam_core.evaluation.score', 'from splatam_core.evaluation.report import html'),
+        ('splatam_ros.frames.rep105', 'from splatam_ros.node.parameters import NodeOptions'),
+        ('splatam_ros.player.player', 'from splatam_ros.frames import rep105'),
         ('splatam_core.slam', 'import rclpy'),
         ('splatam_core.slam', 'def f():\n    from rclpy.node import Node'),
         ('splatam_core.slam', 'from sensor_msgs.msg import Image'),
         ('splatam_core.slam', 'import msg_adapters.images'),
         ('splatam_core.datasets.tum', 'from msg_adapters import images'),
         ('splatam_core.datasets.tum', 'import rosbags.rosbag2'),
-        ('splatam_core.datasets.rosbag', 'import rclpy'),
+        ('splatam_core.datasets.bag.storage', 'import rclpy'),
         ('splatam_core.datasets.files', 'import OpenEXR'),
         ('splatam_core.datasets.record3d', 'def f():\n    import OpenEXR'),
         ('splatam_core.evaluation.similarity', 'import lpips'),
@@ -181,10 +290,10 @@ def test_a_breach_is_seen(module: str, source: str) -> None:
 @pytest.mark.parametrize(
     ('module', 'source'),
     [
-        ('splatam_core.datasets.rosbag', 'from msg_adapters import images\nfrom rosbags.rosbag2 import Reader'),
-        ('splatam_core.slam', 'from . import se3\nfrom .rasterizer.base import Render'),
+        ('splatam_core.datasets.bag.storage', 'from msg_adapters import images\nfrom rosbags.rosbag2 import Reader'),
+        ('splatam_core.slam', 'from .geometry import se3\nfrom .rasterizer.base import Render'),
         ('splatam_core.rasterizer', 'def f():\n    from splatam_core.rasterizer.triton.rasterizer import TritonRasterizer'),
-        ('splatam_core.rasterizer.triton.lists', 'import triton\nfrom splatam_core.rasterizer import triton_kernels'),
+        ('splatam_core.rasterizer.triton.lists', 'import triton\nfrom splatam_core.rasterizer.triton import kernels'),
         ('splatam_core.worker', 'import threading'),
         ('splatam_core.datasets.files', 'def f():\n    import OpenEXR'),
         ('splatam_core.maps.export', 'def f():\n    import open3d'),
