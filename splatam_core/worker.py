@@ -1,4 +1,4 @@
-"""Runs Slam on a thread of its own, fed through a bounded queue. The core's only thread."""
+"""Runs Slam on its own thread, behind a bounded queue of frames. This is the core's only thread."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ WhenFull = Literal['drop_oldest', 'block']
 
 
 class WorkerStopped(RuntimeError):
-    """A frame was submitted to a worker that takes none any more; its cause is what stopped it."""
+    """A frame was submitted to a worker that has stopped; ``__cause__`` is the exception that stopped it, if any."""
 
 
 class SlamWorker:
-    """Owns a Slam: whatever touches it runs on the worker's thread, until ``stop`` has returned.
+    """Owns a Slam. Only the worker's thread may use it, until ``stop`` has returned.
 
-    Frames wait in a bounded queue and are processed in the order they were submitted. When the
-    queue is full a live camera wants ``drop_oldest``, a recording wants ``block``.
+    Frames wait in a bounded queue and are processed in the order of submission. When the queue is full,
+    use ``drop_oldest`` for a live camera and ``block`` for a recording.
 
-    An exception that is no FrameError stops the worker: frames that wait are let go, ``submit``
-    raises WorkerStopped, and ``stop`` raises the exception itself.
+    An exception other than FrameError stops the worker: waiting frames are dropped, ``submit`` raises
+    WorkerStopped, and ``stop`` raises the exception.
     """
 
     def __init__(
@@ -45,11 +45,11 @@ class SlamWorker:
         """Start the thread.
 
         Args:
-            slam: handed over; the caller must not touch it before ``stop`` has returned.
+            slam: the caller must not use it before ``stop`` has returned.
             on_result: called on the worker's thread after each frame; may use the Slam.
             on_bad_frame: called on the worker's thread with each frame that Slam refused.
-            queue_size: frames that may wait, besides the one being processed.
-            when_full: what ``submit`` does when that many wait.
+            queue_size: largest number of waiting frames, in addition to the one being processed.
+            when_full: what ``submit`` does when the queue is full.
             before_frame: called on the worker's thread before each frame; may change the Slam.
 
         Raises:
@@ -77,33 +77,33 @@ class SlamWorker:
 
     @property
     def error(self) -> Exception | None:
-        """What stopped the worker, if something went wrong."""
+        """Exception that stopped the worker; None if there was none."""
         with self._changed:
             return self._error
 
     @property
     def dropped(self) -> int:
-        """Frames let go because the queue was full."""
+        """Number of frames dropped because the queue was full."""
         with self._changed:
             return self._dropped
 
     @property
     def pending(self) -> int:
-        """Frames not done yet: those that wait and the one being processed."""
+        """Number of frames that wait or are being processed."""
         with self._changed:
             return len(self._frames) + self._busy
 
     def submit(self, frame: RgbdFrame) -> None:
-        """Queue a frame; with a full queue drop the oldest or wait for room, as configured.
+        """Queue a frame. If the queue is full, drop the oldest frame or wait, as configured.
 
         Raises:
-            WorkerStopped: the worker is stopping, or an exception has stopped it.
+            WorkerStopped: the worker is stopping or has stopped.
         """
         with self._changed:
             if self._when_full == 'block':
                 self._changed.wait_for(lambda: self._stopping or len(self._frames) < self._queue_size)
             if self._stopping:
-                raise WorkerStopped('the SLAM worker is stopped and takes no frames') from self._error
+                raise WorkerStopped('the SLAM worker has stopped and accepts no frames') from self._error
             if len(self._frames) == self._queue_size:
                 self._frames.popleft()
                 self._dropped += 1
@@ -111,9 +111,9 @@ class SlamWorker:
             self._changed.notify_all()
 
     def call(self, function: Callable[[Slam], T]) -> Future[T]:
-        """Run a function on the worker's thread, between two frames and ahead of those that wait.
+        """Run a function on the worker's thread, before the next waiting frame.
 
-        The future is cancelled when the worker stops before the function has started.
+        The future is cancelled if the worker stops before the function has started.
         """
         future: Future[T] = Future()
         with self._changed:
@@ -128,10 +128,10 @@ class SlamWorker:
         """End the thread and wait for it.
 
         Args:
-            drain: process the frames that wait first; else let them go.
+            drain: True to process the waiting frames first, False to drop them.
 
         Raises:
-            Exception: what stopped the worker, if something went wrong.
+            Exception: the exception that stopped the worker, if there was one.
         """
         with self._changed:
             self._stopping = True
@@ -147,11 +147,11 @@ class SlamWorker:
             while (job := self._next()) is not None:
                 job()
                 self._done()
-        except Exception as error:  # noqa: BLE001 - whatever it is, it surfaces in stop()
+        except Exception as error:  # noqa: BLE001 - stop() raises it
             self._fail(error)
 
     def _next(self) -> Callable[[], None] | None:
-        """Wait for something to do; None when all is done and the worker is stopping."""
+        """Wait for the next job. Returns None when the worker is stopping and nothing is left to do."""
         with self._changed:
             self._changed.wait_for(lambda: self._tasks or self._frames or self._stopping)
             if self._tasks:
@@ -179,7 +179,7 @@ class SlamWorker:
             return
         try:
             future.set_result(function(self._slam))
-        except Exception as error:  # noqa: BLE001 - the caller's function, the caller's exception
+        except Exception as error:  # noqa: BLE001 - the future raises it
             future.set_exception(error)
 
     def _done(self) -> None:

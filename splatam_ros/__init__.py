@@ -1,1 +1,1 @@
-"""The ROS 2 node and the bag player: wiring between messages and the core, no mathematics."""
+"""The ROS 2 node and the bag player. They connect messages to the core."""

@@ -1,6 +1,6 @@
-"""Cameras that people have: what their drivers publish, for the launch file and the documentation.
+"""Topics that the drivers of common cameras publish, for the launch file and the documentation.
 
-Taken from the drivers' own documentation, named in ``source``; no camera was at hand. Parameters that suit them are in
+They are taken from the drivers' documentation (``source``) and were not tested with a camera. Suitable parameters are in
 ``config/ros/NAME.yaml``.
 """
 
@@ -12,16 +12,16 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class CameraTopics:
-    """What a driver publishes.
+    """Topics of a driver.
 
     Attributes:
-        title: the camera.
-        driver: how to start its driver so that depth is registered to colour.
+        title: name of the camera.
+        driver: command that starts the driver with depth registered to colour.
         rgb: colour topic.
         depth: depth topic, registered to colour.
-        info: CameraInfo of colour.
-        facts: encodings and what to know.
-        source: where that is documented.
+        info: CameraInfo topic of the colour camera.
+        facts: encodings and other facts.
+        source: URL of the documentation.
     """
 
     title: str
@@ -40,7 +40,7 @@ CAMERAS: Mapping[str, CameraTopics] = {
         '/camera/camera/color/image_raw',
         '/camera/camera/aligned_depth_to_color/image_raw',
         '/camera/camera/color/camera_info',
-        "rgb8, 16UC1 mm; aligned depth has its colour's stamp",
+        "rgb8, 16UC1 in mm; aligned depth has the stamp of its colour image",
         'https://github.com/IntelRealSense/realsense-ros',
     ),
     'azure_kinect': CameraTopics(
@@ -49,7 +49,7 @@ CAMERAS: Mapping[str, CameraTopics] = {
         '/rgb/image_raw',
         '/depth_to_rgb/image_raw',
         '/rgb/camera_info',
-        'bgra8, 32FC1 m or 16UC1 mm; not undistorted, rational_polynomial: colour and registered depth bend alike',
+        'bgra8, 32FC1 in m or 16UC1 in mm; not undistorted: colour and registered depth have the same distortion (rational_polynomial)',
         'https://github.com/microsoft/Azure_Kinect_ROS_Driver/blob/melodic/docs/usage.md',
     ),
     'orbbec': CameraTopics(
@@ -58,7 +58,7 @@ CAMERAS: Mapping[str, CameraTopics] = {
         '/camera/color/image_raw',
         '/camera/depth/image_raw',
         '/camera/color/camera_info',
-        '16UC1 mm; without depth_registration the same topic is not registered',
+        '16UC1 in mm; without depth_registration the depth on the same topic is not registered',
         'https://orbbec.github.io/OrbbecSDK_ROS2/en/source/4_application_guide/topics.html',
     ),
     'oak': CameraTopics(
@@ -67,7 +67,7 @@ CAMERAS: Mapping[str, CameraTopics] = {
         '/oak/rgb/image_raw',
         '/oak/stereo/image_raw',
         '/oak/rgb/camera_info',
-        '16UC1 mm; pipeline type RGBD with i_align_depth; colour and depth are not exactly in step',
+        '16UC1 in mm; needs the pipeline type RGBD with i_align_depth; the stamps of colour and depth differ slightly',
         'https://docs.luxonis.com/software/ros/depthai-ros/driver',
     ),
     'zed': CameraTopics(
@@ -76,7 +76,7 @@ CAMERAS: Mapping[str, CameraTopics] = {
         '/zed/zed_node/rgb/color/rect/image',
         '/zed/zed_node/depth/depth_registered',
         '/zed/zed_node/rgb/color/rect/camera_info',
-        'bgra8 or bgr8, 32FC1 m (16UC1 mm with openni_depth_mode); rectified; the wrapper before 5 has '
+        'bgra8 or bgr8, 32FC1 in m (16UC1 in mm with openni_depth_mode); rectified; versions of the wrapper before 5 publish '
         'rgb/image_rect_color and rgb/camera_info',
         'https://www.stereolabs.com/docs/ros2',
     ),
@@ -86,7 +86,7 @@ CAMERAS: Mapping[str, CameraTopics] = {
         '/camera/rgb/image_color',
         '/camera/depth/image',
         '/camera/rgb/camera_info',
-        'rgb8, 32FC1 m; registered, but stamped apart by up to half a frame; the frame ids of colour and depth differ',
+        'rgb8, 32FC1 in m; registered; the stamps of colour and depth differ by up to half a frame period, and so do their frame ids',
         'https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats',
     ),
 }

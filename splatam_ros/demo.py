@@ -1,7 +1,7 @@
-"""``make demo``: a recording goes through player, DDS and node, as on a robot, and what comes out is scored.
+"""``make demo``: plays a recording through player, DDS and node, as on a robot, and scores the result.
 
-Run as ``python -m splatam_ros.demo [SOURCE] [--out DIR]``. DIR becomes the run's folder. ``DIR-input``, beside it,
-holds what was played, the SOURCE as a rosbag2 with the node's topic names and small images, and the node's log.
+Run as ``python -m splatam_ros.demo [SOURCE] [--out DIR]``. DIR becomes the run's folder. The folder ``DIR-input`` beside
+it holds the SOURCE as a rosbag2 with the node's topic names and small images, and the node's log.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ LOG_LINES = 15
 
 
 class DemoError(Exception):
-    """Why the demo failed, in words for the person who started it."""
+    """The demo failed; the message explains why to its user."""
 
 
 class Processes:
-    """The demo's child processes; none outlives the ``with`` block.
+    """Child processes of the demo. They end with the ``with`` block.
 
-    Each has a session of its own: Ctrl-C reaches the demo alone, which then stops them in good order.
+    Each has its own session, so that Ctrl-C reaches only the demo, which then stops them in order.
     """
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ class Processes:
         self._started: list[subprocess.Popen[bytes]] = []
 
     def start(self, *command: str, log: Path | None = None) -> subprocess.Popen[bytes]:
-        """Start one of the package's commands; what it says goes to the terminal, or to the log."""
+        """Start one of the package's commands. Its output goes to the log, or to the terminal if there is none."""
         print(f'$ {shlex.join(command)}' + (f' &> {log}' if log else ''), flush=True)
         with log.open('wb') if log else nullcontext() as output:
             process = subprocess.Popen(
@@ -59,14 +59,14 @@ class Processes:
         return process
 
     def run(self, *command: str) -> None:
-        """Run a command to its end.
+        """Run a command and wait for its end.
 
         Raises:
-            DemoError: it failed.
+            DemoError: the command failed.
         """
         process = self.start(*command)
         if process.wait() != 0:
-            raise DemoError(f"'{' '.join(command[:2])}' {ending(process)}; what it said is above")
+            raise DemoError(f"'{' '.join(command[:2])}' {ending(process)}; its output is above")
 
     def __enter__(self) -> Processes:
         return self
@@ -78,40 +78,40 @@ class Processes:
         try:
             for process in running:
                 process.wait(STOP_TIMEOUT_S)
-        except (subprocess.TimeoutExpired, KeyboardInterrupt):  # a second Ctrl-C does not wait any longer
+        except (subprocess.TimeoutExpired, KeyboardInterrupt):  # a second Ctrl-C stops waiting
             for process in running:
                 process.kill()
                 process.wait()
 
 
 def graph_environment(environment: Mapping[str, str], seed: int) -> dict[str, str]:
-    """The environment for a ROS graph that meets no other, unless the user chose which graph to join."""
+    """Returns an environment with a ROS graph of its own, unless the user has set which graph to join."""
     return {
-        'ROS_DOMAIN_ID': str(1 + seed % 101),  # above 101 the ports may belong to somebody else
+        'ROS_DOMAIN_ID': str(1 + seed % 101),  # above 101 the ports may be in use by other programs
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
         **environment,
     }
 
 
 def ending(process: subprocess.Popen[bytes]) -> str:
-    """How a process ended, as the end of a sentence."""
+    """Returns how a process ended, as the end of a sentence."""
     code = process.returncode
     return f'was killed by {signal.Signals(-code).name}' if code < 0 else f'ended with exit code {code}'
 
 
 def last_lines(log: Path) -> str:
-    """The end of a log, indented."""
+    """Returns the last lines of a log, indented."""
     return '\n'.join(f'  {line}' for line in log.read_text(errors='replace').splitlines()[-LOG_LINES:])
 
 
 def require_replaceable(folder: Path) -> None:
-    """Check that a folder is not there, or was made by an earlier demo.
+    """Check that a folder does not exist, or was created by an earlier demo.
 
     Raises:
-        DemoError: somebody else made it.
+        DemoError: the folder was not created by the demo.
     """
     if folder.exists() and not (folder / MARKER).is_file():
-        raise DemoError(f'{folder} exists and was not made by the demo: move it away, or choose another --out')
+        raise DemoError(f'{folder} exists and was not created by the demo: move it away, or choose another --out')
 
 
 def play(processes: Processes, bag: Path, out: Path, log: Path) -> None:
@@ -131,34 +131,34 @@ def play(processes: Processes, bag: Path, out: Path, log: Path) -> None:
 
 
 def wait_for_both(player: subprocess.Popen[bytes], node: subprocess.Popen[bytes]) -> None:
-    """Wait for the player, and then for the node, which must not end first.
+    """Wait for the player and then for the node. The node must not end first.
 
     Raises:
-        DemoError: one of them failed, or the node does not end.
+        DemoError: one of them failed, or the node does not end in time.
     """
     while player.poll() is None:
         if node.poll() is not None:
-            raise DemoError(f'splatam_node {ending(node)} before the recording was over')
+            raise DemoError(f'splatam_node {ending(node)} before the end of the recording')
         time.sleep(0.1)
     if player.returncode != 0:
-        raise DemoError(f'splatam_bag_player {ending(player)}; what it said is above')
+        raise DemoError(f'splatam_bag_player {ending(player)}; its output is above')
     try:
         node.wait(FINISH_TIMEOUT_S)
     except subprocess.TimeoutExpired:
-        raise DemoError(f'splatam_node still runs {FINISH_TIMEOUT_S:.0f} s after the recording') from None
+        raise DemoError(f'splatam_node is still running {FINISH_TIMEOUT_S:.0f} s after the end of the recording') from None
     if node.returncode != 0:
         raise DemoError(f'splatam_node {ending(node)}')
 
 
 def demo(source: str | None, out: Path) -> None:
-    """Make a bag of the source, play it, score the run.
+    """Convert the source to a bag, play it, and score the run.
 
     Args:
         source: any recording that ``splatam convert`` reads; None = a synthetic room.
         out: folder of the run.
 
     Raises:
-        DemoError: a step failed, and why.
+        DemoError: a step failed.
     """
     work = out.with_name(f'{out.name}-input')
     bag = work / 'recording'
@@ -180,21 +180,21 @@ def demo(source: str | None, out: Path) -> None:
 
 
 def stop(number: int, frame: FrameType | None) -> None:
-    """End the demo with its processes."""
+    """End the demo and its processes."""
     raise KeyboardInterrupt
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the demo; returns the exit code."""
+    """Run the demo. Returns the exit code."""
     parser = argparse.ArgumentParser('splatam_ros.demo', description='Play a recording into the node and score it.')
     parser.add_argument('source', nargs='?', metavar='SOURCE', help='a rosbag2 or a dataset (default: a synthetic room)')
     parser.add_argument('--out', type=Path, default=Path('out/demo'), help='folder of the run (default: %(default)s)')
     args = parser.parse_args(arguments)
-    for number in (signal.SIGINT, signal.SIGTERM):  # a shell's background jobs would ignore SIGINT
+    for number in (signal.SIGINT, signal.SIGTERM):  # background jobs of a shell ignore SIGINT otherwise
         signal.signal(number, stop)
     try:
         demo(args.source, args.out)
-        print(f'look at    {args.out}/report.html, and report.png, map.ply, trajectory.txt, metrics.json beside it')
+        print(f'look at {args.out}/report.html; beside it are report.png, map.ply, trajectory.txt and metrics.json')
     except DemoError as error:
         print(f'demo: {error}', file=sys.stderr)
         return 1

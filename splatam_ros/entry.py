@@ -1,4 +1,4 @@
-"""The executables: nothing here needs ROS, so that its absence can be said in one line."""
+"""Entry points of the executables. They do not import ROS, so that a missing ROS is reported in one line."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 from importlib import import_module
 
 _EXIT_USAGE = 2
-_EXIT_INTERRUPTED = 130  # as shells say it: 128 + SIGINT
+_EXIT_INTERRUPTED = 130  # by the convention of shells: 128 + SIGINT
 
 
 def node() -> int:
@@ -30,6 +30,6 @@ def _main(module: str) -> int:
             file=sys.stderr,
         )
         return _EXIT_USAGE
-    except KeyboardInterrupt:  # loading takes seconds, and there is nothing to put in order yet
+    except KeyboardInterrupt:  # during the import, which takes seconds; there is nothing to clean up yet
         return _EXIT_INTERRUPTED
     return main()

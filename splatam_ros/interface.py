@@ -1,6 +1,6 @@
-"""What the node is to the outside besides ``OUTPUTS`` and ``NODE_SETTINGS``: topics and frames, for the documentation.
+"""The node's topics and coordinate frames that are not in ``OUTPUTS`` or ``NODE_SETTINGS``, for the documentation.
 
-``tools/ros_reference.py`` writes these tables into docs/ros.md; a test holds them against a running node.
+``tools/ros_reference.py`` writes these tables into docs/ros.md. A test compares them with a running node.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic the node publishes or subscribes to.
+    """A topic that the node publishes or subscribes to.
 
     Attributes:
-        name: before remapping.
+        name: name before remapping.
         type_name: e.g. ``sensor_msgs/msg/Image``.
-        help: what it is for.
-        when: when there are messages; empty for inputs.
+        help: one line for the documentation.
+        when: when it is published; empty for inputs.
     """
 
     name: str
@@ -30,9 +30,9 @@ class Frame:
     """A coordinate frame.
 
     Attributes:
-        default: its name where nobody says otherwise.
-        parameter: that names it.
-        help: what it is, and who publishes the transform from its parent.
+        default: default name.
+        parameter: parameter that sets the name.
+        help: meaning of the frame, and who publishes the transform from its parent.
     """
 
     default: str
@@ -41,34 +41,34 @@ class Frame:
 
 
 INPUTS = (
-    Topic('rgb/image', 'sensor_msgs/msg/Image', 'colour'),
-    Topic('rgb/image/compressed', 'sensor_msgs/msg/CompressedImage', 'instead, with `rgb_transport: compressed`'),
-    Topic('depth/image', 'sensor_msgs/msg/Image', 'depth, registered to colour'),
+    Topic('rgb/image', 'sensor_msgs/msg/Image', 'colour image'),
+    Topic('rgb/image/compressed', 'sensor_msgs/msg/CompressedImage', 'replaces `rgb/image` with `rgb_transport: compressed`'),
+    Topic('depth/image', 'sensor_msgs/msg/Image', 'depth image, registered to colour'),
     Topic('depth/image/compressedDepth', 'sensor_msgs/msg/CompressedImage',
-          'instead, with `depth_transport: compressedDepth`'),
-    Topic('rgb/camera_info', 'sensor_msgs/msg/CameraInfo', 'of the colour camera'),
-    Topic('odom', 'nav_msgs/msg/Odometry', 'where to start tracking from, with `odom.source: topic`'),
-    Topic('/tf_static', 'tf2_msgs/msg/TFMessage', 'where the camera is in the base, and which frames have a parent'),
-    Topic('/tf', 'tf2_msgs/msg/TFMessage', 'where to start tracking from, with `odom.source: tf`'),
+          'replaces `depth/image` with `depth_transport: compressedDepth`'),
+    Topic('rgb/camera_info', 'sensor_msgs/msg/CameraInfo', 'calibration of the colour camera'),
+    Topic('odom', 'nav_msgs/msg/Odometry', 'odometry from which tracking starts, with `odom.source: topic`'),
+    Topic('/tf_static', 'tf2_msgs/msg/TFMessage', 'pose of the camera in the base; which frames already have a parent'),
+    Topic('/tf', 'tf2_msgs/msg/TFMessage', 'odometry from which tracking starts, with `odom.source: tf`'),
 )  # fmt: skip
 
 OUTPUTS = (
-    Topic('~/processed', 'std_msgs/msg/Header', 'the stamp of a frame that is done with', 'every frame, lost ones too'),
-    Topic('/tf', 'tf2_msgs/msg/TFMessage', 'see Frames', 'with every pose, with `publish_tf`'),
+    Topic('~/processed', 'std_msgs/msg/Header', 'stamp of a frame that is completely processed, skipped or refused', 'with every frame, also lost ones'),
+    Topic('/tf', 'tf2_msgs/msg/TFMessage', 'see Frames', 'with every pose, if `publish_tf`'),
     Topic('/tf_static', 'tf2_msgs/msg/TFMessage', 'base to camera, from `camera_in_base`; latched',
-          'with `publish_tf`, where nobody else has it'),
-    Topic('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', 'input, tracking, processing, map',
-          '1 Hz, steady clock'),
+          'with the first pose, if `publish_tf` and no one else publishes it'),
+    Topic('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', 'statuses input, tracking, processing and map',
+          'at 1 Hz of the steady clock'),
 )  # fmt: skip
 
 FRAMES = (
     Frame('map', 'map_frame',
-          'fixed: the first camera, optical axes; or with `world_up: z_up` where the base, or without one the first '
-          'camera, began, x forward and z up'),
+          'fixed frame: the first camera, in optical axes; with `world_up: z_up` the first base (the first camera, if there '
+          'is no base), x forward and z up'),
     Frame('odom', 'odom_frame',
-          'the same as map, or with `odom.source` what the odometry drifts in; from map: this node'),
-    Frame('empty', 'base_frame', 'the robot; from odom: this node, or with `odom.source` the odometry'),
-    Frame("the images' frame", 'camera_frame',
-          "the optical frame of the camera; from base: the robot's /tf_static, or this node with `camera_in_base`; "
-          'from odom, without a base: this node'),
+          'equal to map, or with `odom.source` the frame in which the odometry drifts; map to odom: published by this node'),
+    Frame('empty', 'base_frame', 'the robot; odom to base: published by this node, or with `odom.source` by the odometry'),
+    Frame("the images' frame id", 'camera_frame',
+          'optical frame of the camera; base to camera: published on /tf_static by the robot, or with `camera_in_base` by '
+          'this node; without a base, odom to camera: published by this node'),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What the node's process and the player's have in common: transport, signals, ROS up and down."""
+"""Shared by the processes of node and player: transport, signals, start and end of ROS."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
 class RosError(SplatamError):
-    """A ROS argument, parameter or topic that cannot be used."""
+    """A ROS argument, parameter or topic cannot be used."""
 
 
 class StopRequest:
-    """Turns SIGINT and SIGTERM into a request, however often they come, so that work ends in good order.
+    """Turns SIGINT and SIGTERM into a request to stop, so that the program can finish its work. Repeated signals are ignored.
 
-    rclpy's own handlers would tear the context down at once: nothing could be published any more.
-    Use as a context manager in the main thread.
+    The handlers of rclpy would shut the context down at once, and nothing could be published any more.
+    Use it as a context manager in the main thread.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -37,7 +37,7 @@ class StopRequest:
 
     @property
     def requested(self) -> bool:
-        """Whether a signal has come."""
+        """True if a signal has arrived."""
         return self.signal is not None
 
     def __enter__(self) -> StopRequest:
@@ -53,9 +53,9 @@ class StopRequest:
 
 
 def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """A command line in two: what is for the program, and what is for ROS, from ``--ros-args`` to ``--``.
+    """Split a command line into the program's own arguments and those for ROS (from ``--ros-args`` to ``--``).
 
-    rcl would take every ``a:=b`` for itself, also the player's own ``--remap a:=b``.
+    They are kept apart because rcl takes every ``a:=b`` for itself, even the player's ``--remap a:=b``.
     """
     own: list[str] = []
     for_ros: list[str] = []
@@ -71,10 +71,10 @@ def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
 
 @contextmanager
 def ros(arguments: Sequence[str]) -> Iterator[None]:
-    """ROS for the duration of a ``with``: a transport that takes large images, no signal handlers.
+    """Initialize ROS for the duration of a ``with``: with a transport for large images, without signal handlers.
 
     Args:
-        arguments: what is for ROS of the command line.
+        arguments: the command line's arguments for ROS.
 
     Raises:
         RosError: the ROS arguments cannot be parsed.
@@ -82,7 +82,7 @@ def ros(arguments: Sequence[str]) -> Iterator[None]:
     os.environ.setdefault(PROFILE_VARIABLE, str(config_dir() / 'fastdds_large_data.xml'))
     try:
         rclpy.init(args=['', *arguments], signal_handler_options=SignalHandlerOptions.NO)
-    except rclpy_implementation.UnknownROSArgsError as error:  # its text is the list of them
+    except rclpy_implementation.UnknownROSArgsError as error:  # its text is the list of unknown arguments
         hint = 'a rule is -p NAME:=VALUE or -r NAME:=NAME, in quotes if it has spaces'
         raise RosError(f'ROS arguments: not understood: {error}; {hint}') from None
     except RuntimeError as error:  # rclpy's errors have no narrower public base
@@ -94,5 +94,5 @@ def ros(arguments: Sequence[str]) -> Iterator[None]:
 
 
 def _first_sentence(error: Exception) -> str:
-    """Rcl's message without its own preamble, and without the source lines it appends."""
+    """Returns rcl's message without its preamble and without the source locations at its end."""
     return str(error).split(', at /')[0].removeprefix('failed to initialize rcl: ')

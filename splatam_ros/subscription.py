@@ -1,4 +1,4 @@
-"""One subscribed input topic."""
+"""A subscription to one input topic that keeps statistics and adapts its QoS."""
 
 from __future__ import annotations
 
@@ -27,49 +27,49 @@ CHOICES = {
         (QoSPolicyKind.DURABILITY, DurabilityPolicy),
     )
 }  # fmt: skip
-NOT_OURS = ('/clock', '/parameter_events')  # rclpy subscribes to them, with overrides of its own
+RCLPY_TOPICS = ('/clock', '/parameter_events')  # rclpy subscribes to them itself, with overrides of its own
 
 
-class Input:
-    """A subscription that settles for best effort when a publisher offers no better.
+class MonitoredSubscription:
+    """A subscription that keeps statistics, and falls back to best effort if the publisher offers no reliable QoS.
 
-    A best-effort subscription would take both kinds of publisher, but loses large images from either. Parameters
-    ``qos_overrides.TOPIC.subscription.POLICY`` have the last word, as usual in ROS.
+    A best-effort subscription would match both kinds of publisher, but it loses large images even of a reliable one.
+    As usual in ROS, parameters ``qos_overrides.TOPIC.subscription.POLICY`` take precedence.
 
     Attributes:
-        name: as given, before remapping.
+        name: topic name before remapping.
         type_name: e.g. ``sensor_msgs/msg/Image``.
-        incompatible_policy: the QoS policy in which a publisher offers less than was asked for; empty if none does.
-        received: messages so far.
-        delay_s: from the stamp of the newest message to its arrival; None before the first.
-        heard_s: when the last one came, by the monotonic clock; when this was made, before the first.
+        incompatible_policy: QoS policy in which a publisher offers less than requested; empty if there is none.
+        received: number of messages so far.
+        delay_s: time from the stamp of the newest message to its arrival; None before the first message.
+        last_received_s: monotonic time at which the last message had been handled; of subscribing, before the first.
     """
 
     def __init__(
-        self, node: Node, message_class: type, topic: str, on_message: Callable[[Any], None], *,
+        self, node: Node, message_class: type, topic: str, on_message: Callable[[Any], object], *,
         reliability: str, keep_all: bool,
     ) -> None:  # fmt: skip
         """Subscribe.
 
         Args:
-            node: to subscribe with.
-            message_class: rclpy's.
-            topic: relative name, remapped as usual.
-            on_message: called by the executor.
+            node: the node that subscribes.
+            message_class: message class of rclpy.
+            topic: relative topic name; remapping applies.
+            on_message: called on the executor's thread with each message.
             reliability: auto, reliable or best_effort.
-            keep_all: keep every message until it is taken, not just the newest.
+            keep_all: True to queue every message until it is handled, False to keep only the newest ones.
 
         Raises:
-            RosError: a parameter that overrides the QoS has a value that no policy has.
+            RosError: a QoS override has a value that its policy does not allow.
         """
+        self.name = topic
         self.type_name = f'{message_class.__module__.split(".")[0]}/msg/{message_class.__name__}'
         self.incompatible_policy = ''
         self.received = 0
         self.delay_s: float | None = None
-        self.heard_s = time.monotonic()
+        self.last_received_s = time.monotonic()
         self._node = node
         self._message_class = message_class
-        self.name = topic
         self._on_message = on_message
         overridden = _check_overrides(node, node.resolve_topic_name(topic))
         self._may_fall_back = reliability == 'auto' and QoSPolicyKind.RELIABILITY not in overridden
@@ -87,17 +87,17 @@ class Input:
 
     @property
     def num_publishers(self) -> int:
-        """Publishers on the graph, compatible or not."""
+        """Number of publishers on the graph, compatible or not."""
         return self._node.count_publishers(self.topic)
 
     @property
     def other_type(self) -> str:
-        """The type that is published on the topic, if it is not ours; else empty."""
+        """Type that is published on the topic, if it differs from ours; else empty."""
         types = {publisher.topic_type for publisher in self._node.get_publishers_info_by_topic(self.topic)}
         return '' if not types or self.type_name in types else sorted(types)[0]
 
     def candidates(self) -> list[str]:
-        """Topics of our type that somebody publishes."""
+        """Returns the published topics of our type, except those of this node."""
         return sorted(
             topic
             for topic, types in self._node.get_topic_names_and_types()
@@ -106,7 +106,7 @@ class Input:
         )  # fmt: skip
 
     def close(self) -> None:
-        """Take no more messages."""
+        """Unsubscribe."""
         self._node.destroy_subscription(self._subscription)
 
     def _subscribe(self, qos: QoSProfile, overriding: QoSOverridingOptions | None) -> Subscription:
@@ -119,22 +119,26 @@ class Input:
         self.received += 1
         self.delay_s = (self._node.get_clock().now().nanoseconds - stamps.message_stamp_ns(message)) / 1e9
         self._on_message(message)
-        self.heard_s = time.monotonic()  # after the message, which may have waited for SLAM
+        self.last_received_s = time.monotonic()  # afterwards, because handling a message may wait for SLAM
 
     def _on_incompatible(self, event: QoSRequestedIncompatibleQoSInfo) -> None:
         if not self._may_fall_back or event.last_policy_kind != QoSPolicyKind.RELIABILITY:
             self.incompatible_policy = QoSPolicyKind(event.last_policy_kind).name.lower()
             return
         self._may_fall_back = False
-        self._node.get_logger().info(f'{self.topic} is published best effort: subscribing to it best effort')
+        self._node.get_logger().info(f'{self.topic} is published best effort; subscribing with best effort')
         self._node.destroy_subscription(self._subscription)
-        qos = copy.copy(self._qos)  # with what was overridden
+        qos = copy.copy(self._qos)  # including the overrides, which rclpy has written into it
         qos.reliability = ReliabilityPolicy.BEST_EFFORT
         self._subscription = self._subscribe(qos, None)
 
 
 def _check_overrides(node: Node, topic: str) -> list[QoSPolicyKind]:
-    """The policies of a topic that parameters override."""
+    """Returns the QoS policies of a topic that parameters override.
+
+    Raises:
+        RosError: a value is not allowed.
+    """
     names = {policy: QOS_OVERRIDE.format(topic, policy.name.lower()) for policy in OVERRIDABLE}
     overridden = [policy for policy, name in names.items() if node.has_parameter(name)]
     for policy in overridden:
@@ -148,12 +152,13 @@ def _check_overrides(node: Node, topic: str) -> list[QoSPolicyKind]:
 
 
 def unused_overrides(node: Node, topics: Sequence[str]) -> list[str]:
-    """Parameters that override a QoS of no topic of these, or no policy of it: misspelt, or not as remapped.
+    """Returns the QoS override parameters that match none of the topics: misspelt, or named before remapping.
 
     Args:
-        node: whose parameters.
+        node: the node that has the parameters.
         topics: names on the graph.
     """
     used = {QOS_OVERRIDE.format(topic, policy.name.lower()) for topic in topics for policy in OVERRIDABLE}
     given = [QOS_OVERRIDES + name for name in node.get_parameters_by_prefix(QOS_OVERRIDES.rstrip('.'))]
-    return sorted(name for name in given if name not in used and not name.startswith(tuple(QOS_OVERRIDES + t for t in NOT_OURS)))
+    ignored = tuple(QOS_OVERRIDES + topic for topic in RCLPY_TOPICS)
+    return sorted(name for name in given if name not in used and not name.startswith(ignored))

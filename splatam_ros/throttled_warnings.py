@@ -1,4 +1,4 @@
-"""Warnings that may repeat with every frame, said once in a while."""
+"""Limits the rate of warnings that could repeat with every frame."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from rclpy.impl.rcutils_logger import RcutilsLogger
 
 
 class ThrottledWarnings:
-    """Logs the first warning of each kind, and then one in a period, saying how many there were meanwhile."""
+    """Logs the first warning of each kind, then at most one per period with the number of suppressed ones."""
 
     def __init__(self, logger: RcutilsLogger, period_s: float = 10.0) -> None:
         """Log to a node's logger.
 
         Args:
-            logger: where to.
-            period_s: between two warnings of the same kind.
+            logger: receives the warnings.
+            period_s: shortest time between two warnings of the same kind.
         """
         self._logger = logger
         self._period_s = period_s
-        self._said_s: dict[str, float] = {}
-        self._withheld: dict[str, int] = {}
+        self._logged_s: dict[str, float] = {}
+        self._num_suppressed: dict[str, int] = {}
 
     def warn(self, kind: str, text: str) -> None:
-        """Say it, unless something of this kind was said a moment ago."""
+        """Log a warning, unless one of the same kind was logged less than a period ago."""
         now_s = time.monotonic()
-        if now_s - self._said_s.get(kind, -float('inf')) < self._period_s:
-            self._withheld[kind] = self._withheld.get(kind, 0) + 1
+        if now_s - self._logged_s.get(kind, -float('inf')) < self._period_s:
+            self._num_suppressed[kind] = self._num_suppressed.get(kind, 0) + 1
             return
-        self._said_s[kind] = now_s
-        withheld = self._withheld.pop(kind, 0)
-        self._logger.warning(text + (f' (and {withheld} more of this kind before)' if withheld else ''))
+        self._logged_s[kind] = now_s
+        suppressed = self._num_suppressed.pop(kind, 0)
+        self._logger.warning(text + (f' (and {suppressed} more of this kind before)' if suppressed else ''))

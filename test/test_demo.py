@@ -75,7 +75,7 @@ def test_what_somebody_else_made_is_left_alone(out: Path, name: str) -> None:
     said, _ = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 1
     assert said.splitlines() == [
-        f'demo: {precious.parent} exists and was not made by the demo: move it away, or choose another --out'
+        f'demo: {precious.parent} exists and was not created by the demo: move it away, or choose another --out'
     ]
     assert precious.exists()
 
@@ -85,7 +85,7 @@ def test_a_step_that_fails_is_named(out: Path) -> None:
     said, _ = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 1
     assert 'no such file or folder' in said
-    assert said.splitlines()[-1] == "demo: 'splatam convert' ended with exit code 2; what it said is above"
+    assert said.splitlines()[-1] == "demo: 'splatam convert' ended with exit code 2; its output is above"
 
 
 def test_a_node_that_dies_ends_the_demo_with_its_last_words(out: Path) -> None:

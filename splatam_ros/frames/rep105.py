@@ -1,8 +1,8 @@
-"""Where things are in ROS's frames, ``map → odom → base → camera`` (REP 105).
+"""Transforms between the coordinate frames of REP 105: ``map → odom → base → camera``.
 
-What is given is where the camera is in the core's world, which is the first camera in optical axes and stays so.
-``map`` is the same, or with ``world_up: z_up`` upright (REP 103: x forward, z up): where the base was at first, or
-without a base the first camera.
+The core reports the pose of the camera in its world: the first camera, in optical axes. ``map`` equals that world, or
+with ``world_up: z_up`` it is upright (REP 103: x forward, z up) and starts at the first base, or at the first camera
+if there is no base.
 """
 
 from __future__ import annotations
@@ -14,28 +14,29 @@ from numpy.typing import NDArray
 
 from splatam_core.errors import ConfigError
 from splatam_core.geometry import se3
-from splatam_ros.frames.buffer import TransformError, TransformTree
-from splatam_ros.node.parameters import NodeOptions
+from splatam_ros.frames.buffer import TransformBuffer, TransformError
+from splatam_ros.frames.options import FrameOptions
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 Matrix = NDArray[np.float64]
+Link = tuple[str, str]  # parent and child
 
-# Optical axes (x right, y down, z forward) in a body's (x forward, y left, z up); REP 103.
+# Optical axes (x right, y down, z forward) in body axes (x forward, y left, z up); REP 103.
 T_BODY_OPTICAL: Matrix = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Located:
-    """A tracked camera in ROS's frames.
+    """A tracked camera in the coordinate frames of ROS.
 
     Attributes:
-        stamp_ns: of the frame.
+        stamp_ns: stamp of the frame.
         camera_frame: name of the camera's optical frame.
-        body_frame: name of what is located: the base, or the camera where no base is known.
-        T_map_world: [4, 4] from the core's world.
-        T_map_camera: [4, 4] pose of the camera.
-        T_map_body: [4, 4] pose of the body.
-        T_map_odom: [4, 4] what the odometry has to be corrected by; None where it is not known at this stamp.
+        body_frame: name of the located body: the base, or the camera if there is no base.
+        T_map_world: [4, 4] core's world to map.
+        T_map_camera: [4, 4] pose of the camera in the map.
+        T_map_body: [4, 4] pose of the body in the map.
+        T_map_odom: [4, 4] correction of the odometry; None if the odometry is not known at this stamp.
     """
 
     stamp_ns: int
@@ -47,101 +48,108 @@ class Located:
     T_map_odom: Matrix | None
 
 
-class Frames:
-    """Names of the frames and the transforms between them."""
+class CoordinateFrames:
+    """Names of the coordinate frames and the transforms between them."""
 
-    def __init__(self, options: NodeOptions, tree: TransformTree, warnings: ThrottledWarnings) -> None:
-        """Check the parameters.
+    def __init__(self, options: FrameOptions, buffer: TransformBuffer, warnings: ThrottledWarnings) -> None:
+        """Check the options.
+
+        Args:
+            options: names and sources of the frames.
+            buffer: transforms received from others.
+            warnings: receives a warning when a transform is missing.
 
         Raises:
-            ConfigError: they contradict each other, or ``camera_in_base`` is no pose.
+            ConfigError: the options contradict each other, or ``camera_in_base`` is not a pose.
         """
         self._options = options
-        self._tree = tree
+        self._buffer = buffer
         self._warnings = warnings
         self._T_base_camera = parse_pose('camera_in_base', options.camera_in_base) if options.camera_in_base else None
-        self._T_map_world: Matrix | None = None
-        self._fixes_camera = False
+        self._publishes_camera = False
         if self._T_base_camera is not None and not options.base_frame:
             raise ConfigError("camera_in_base is set, but base_frame is ''; name the frame that the camera is fixed to")
-        if self.has_odometry and not options.odom_frame:
+        if options.has_odometry and not options.odom_frame:
             raise ConfigError(f"odom_frame is '', but odom.source is {options.odom_source}; name the odometry's frame")
         names = [name for name in (options.map_frame, options.odom_frame, options.base_frame) if name]
         if not options.map_frame or len(set(names)) < len(names):
-            raise ConfigError(f'map_frame, odom_frame and base_frame are {names}; map_frame is needed, and all differ')
+            raise ConfigError(f'map_frame, odom_frame and base_frame are {names}; map_frame must be set, and all names must differ')
 
-    @property
-    def has_odometry(self) -> bool:
-        """Whether somebody else says where the body is in the odometry's frame."""
-        return self._options.odom_source != 'none'
-
-    @property
-    def looks_up(self) -> bool:
-        """Whether the pose of the camera in the base is looked up."""
-        return bool(self._options.base_frame) and self._T_base_camera is None
-
-    def reset(self) -> None:
-        """A new world begins."""
-        self._T_map_world = None
-
-    def camera_frame(self, header_frame: str) -> str:
-        """Name of the camera's frame, given what the images' headers say."""
-        return self._options.camera_frame or header_frame.removeprefix('/')
+    def camera_frame(self, frame_id: str) -> str:
+        """Returns the name of the camera's frame, given the frame id of an image."""
+        return self._options.camera_frame or frame_id.removeprefix('/')
 
     def body_frame(self, camera_frame: str) -> str:
-        """Name of what is located."""
+        """Returns the name of the located body: the base, or the camera if there is no base."""
         return self._options.base_frame or camera_frame
 
-    def locate(self, stamp_ns: int, T_world_cam: Matrix, camera_frame: str) -> Located | None:
-        """A tracked camera in ROS's frames; None, with a warning, while the camera's pose in the base is not known."""
+    def locate(self, stamp_ns: int, frame_id: str, T_world_cam: Matrix, T_map_world: Matrix | None) -> Located | None:
+        """Express a tracked camera in the coordinate frames of ROS.
+
+        Args:
+            stamp_ns: stamp of the frame.
+            frame_id: frame id of its colour image.
+            T_world_cam: [4, 4] camera to the core's world.
+            T_map_world: [4, 4] core's world to map; None for the first located frame of a world, which defines it.
+
+        Returns:
+            None, after a warning, while the pose of the camera in the base is not known.
+        """
+        camera_frame = self.camera_frame(frame_id)
         try:
             T_body_camera = self._T_body_camera(camera_frame, stamp_ns)
         except TransformError as error:
             self._warnings.warn(
-                'extrinsic', f"nothing is published: where '{camera_frame}' is in '{self._options.base_frame}' is not "
+                'extrinsic', f"nothing is published: the pose of '{camera_frame}' in '{self._options.base_frame}' is not "
                 f'known ({error}); publish it on /tf_static, or set camera_in_base',
             )  # fmt: skip
             return None
-        if self._T_map_world is None:
-            self._T_map_world = self._upright(T_body_camera)
-        T_map_camera = self._T_map_world @ T_world_cam
+        if T_map_world is None:
+            T_map_world = self._new_map(T_body_camera)
+        T_map_camera = T_map_world @ T_world_cam
         return Located(
-            stamp_ns, camera_frame, self.body_frame(camera_frame), self._T_map_world, T_map_camera,
-            T_map_camera @ se3.inverse(T_body_camera), self._T_map_odom(T_map_camera, camera_frame, stamp_ns),
-        )  # fmt: skip
+            stamp_ns=stamp_ns,
+            camera_frame=camera_frame,
+            body_frame=self.body_frame(camera_frame),
+            T_map_world=T_map_world,
+            T_map_camera=T_map_camera,
+            T_map_body=T_map_camera @ se3.inverse(T_body_camera),
+            T_map_odom=self._T_map_odom(T_map_camera, camera_frame, stamp_ns),
+        )
 
     def odometry(self, camera_frame: str, stamp_ns: int, timeout_s: float = 0.0) -> Matrix:
-        """[4, 4] pose of the camera in the odometry's frame.
+        """Returns the [4, 4] pose of the camera in the odometry's frame.
 
         Raises:
             TransformError: it is not known at the stamp, even after waiting for it.
         """
-        T_odom_body = self._tree.lookup(self._options.odom_frame, self.body_frame(camera_frame), stamp_ns, timeout_s)
+        T_odom_body = self._buffer.lookup(self._options.odom_frame, self.body_frame(camera_frame), stamp_ns, timeout_s)
         return T_odom_body @ self._T_body_camera(camera_frame, stamp_ns)
 
-    def moving(self, located: Located) -> dict[tuple[str, str], Matrix]:
-        """What belongs on ``/tf``: ``T_parent_child`` by (parent, child)."""
+    def moving(self, located: Located) -> dict[Link, Matrix]:
+        """Returns the transforms to publish on ``/tf``: ``T_parent_child`` by (parent, child)."""
         map_frame, odom_frame = self._options.map_frame, self._options.odom_frame
-        if self.has_odometry:
+        if self._options.has_odometry:
             return {} if located.T_map_odom is None else {(map_frame, odom_frame): located.T_map_odom}
-        if (parent := self._tree.fixed_parent(located.body_frame)) is not None:
+        if (parent := self._buffer.static_parent(located.body_frame)) is not None:
             self._warnings.warn(
-                'parents', f"nothing on /tf: '{located.body_frame}' is fixed to '{parent}' by /tf_static, and a "
-                f"frame has one parent; set base_frame to '{self._tree.root(parent)}'",
+                'parents', f"nothing is published on /tf: on /tf_static '{located.body_frame}' is fixed to '{parent}', and "
+                f"a frame can have one parent only; set base_frame to '{self._buffer.static_root(parent)}'",
             )  # fmt: skip
             return {}
         if not odom_frame:
             return {(map_frame, located.body_frame): located.T_map_body}
         return {(map_frame, odom_frame): np.eye(4), (odom_frame, located.body_frame): located.T_map_body}
 
-    def fixed(self, camera_frame: str) -> dict[tuple[str, str], Matrix]:
-        """What belongs on ``/tf_static``: the camera in the base, where a parameter says so and nobody else does."""
+    def static(self, camera_frame: str) -> dict[Link, Matrix]:
+        """Returns the transforms to publish on ``/tf_static``: the camera in the base, unless someone else publishes it."""
         if self._T_base_camera is None:
             return {}
-        self._fixes_camera |= self._tree.fixed_parent(camera_frame) is None  # then we hear ourselves
-        if not self._fixes_camera:
+        self._publishes_camera |= self._buffer.static_parent(camera_frame) is None  # later, the buffer holds our own
+        if not self._publishes_camera:
             self._warnings.warn(
-                'two extrinsics', f"camera_in_base is used but not published: /tf_static has '{camera_frame}' already"
+                'two extrinsics',
+                f"camera_in_base is used but not published, because /tf_static already has '{camera_frame}'",
             )
             return {}
         return {(self._options.base_frame, camera_frame): self._T_base_camera}
@@ -151,28 +159,35 @@ class Frames:
             return np.eye(4)
         if self._T_base_camera is not None:
             return self._T_base_camera
-        return self._tree.lookup(self._options.base_frame, camera_frame, stamp_ns)
+        return self._buffer.lookup(self._options.base_frame, camera_frame, stamp_ns)
 
-    def _upright(self, T_body_camera: Matrix) -> Matrix:
-        """[4, 4] ``T_map_world``."""
+    def _new_map(self, T_body_camera: Matrix) -> Matrix:
+        """Returns the [4, 4] ``T_map_world`` of a world that begins."""
         if self._options.world_up == 'optical':
             return np.eye(4)
         return T_body_camera if self._options.base_frame else T_BODY_OPTICAL
 
     def _T_map_odom(self, T_map_camera: Matrix, camera_frame: str, stamp_ns: int) -> Matrix | None:
-        if not self.has_odometry:
+        if not self._options.has_odometry:
             return np.eye(4)
         try:
             return T_map_camera @ se3.inverse(self.odometry(camera_frame, stamp_ns))
-        except TransformError:  # the motion prior has waited for it, and said so
+        except TransformError:  # OdometryPrior has waited for it and has warned
             return None
 
 
 def parse_pose(name: str, text: str) -> Matrix:
-    """[4, 4] of ``x y z qx qy qz qw`` or ``x y z roll pitch yaw`` (metres, radians, rotations about fixed axes).
+    """Parse ``x y z qx qy qz qw`` or ``x y z roll pitch yaw`` (metres, radians, rotations about fixed axes).
+
+    Args:
+        name: name of the parameter, for the error message.
+        text: numbers separated by spaces or commas.
+
+    Returns:
+        [4, 4] pose.
 
     Raises:
-        ConfigError: the text of this parameter is no pose.
+        ConfigError: the text is not a pose.
     """
     try:
         values = np.array([float(word) for word in text.replace(',', ' ').split()])

@@ -1,4 +1,4 @@
-"""``/tf`` and ``/tf_static``. Without tf2_msgs, which pip's ROS lacks, all is mute."""
+"""The topics ``/tf`` and ``/tf_static``. Without tf2_msgs, which ROS from pip lacks, the node uses neither."""
 
 from __future__ import annotations
 
@@ -13,68 +13,67 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from msg_adapters import poses, stamps
 from msg_adapters.errors import MessageError
-from msg_adapters.factory import RclpyMessages
-from splatam_ros.frames.buffer import TransformTree
-from splatam_ros.player.recording import message_class
+from msg_adapters.factory import RclpyMessages, message_class
+from splatam_ros.frames.buffer import TransformBuffer
+from splatam_ros.frames.options import FrameOptions
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 Matrix = NDArray[np.float64]
 
+# The QoS profiles of tf2.
 TF_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-HEAR_STATIC_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE,
-                             durability=DurabilityPolicy.TRANSIENT_LOCAL)  # fmt: skip
-SAY_STATIC_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
-                            durability=DurabilityPolicy.TRANSIENT_LOCAL)  # fmt: skip
+SUBSCRIBE_STATIC_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE,
+                                  durability=DurabilityPolicy.TRANSIENT_LOCAL)  # fmt: skip
+PUBLISH_STATIC_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
+                                durability=DurabilityPolicy.TRANSIENT_LOCAL)  # fmt: skip
 
 
-class Tf:
-    """The node's ears and voice on ``/tf`` and ``/tf_static``; topics and QoS are tf2's.
+class TfTopics:
+    """Receives transforms into a buffer, and publishes transforms.
 
     Attributes:
-        is_available: whether tf2_msgs is installed.
+        is_available: True if tf2_msgs is installed.
     """
 
-    def __init__(
-        self, node: Node, tree: TransformTree, warnings: ThrottledWarnings, *,
-        hears: bool, hears_moving: bool, says: bool,
-    ) -> None:  # fmt: skip
-        """Subscribe and advertise.
+    def __init__(self, node: Node, options: FrameOptions, buffer: TransformBuffer, warnings: ThrottledWarnings) -> None:
+        """Subscribe and advertise what the options need.
 
         Args:
-            node: to do so with.
-            tree: takes what is heard.
-            warnings: says what cannot be used.
-            hears: whether to listen to ``/tf_static``.
-            hears_moving: whether to listen to ``/tf`` as well.
-            says: whether to publish.
+            node: the node that subscribes and publishes.
+            options: say which topics are needed.
+            buffer: receives the transforms of others.
+            warnings: receives a warning about a transform that cannot be used.
         """
         self._node = node
-        self._tree = tree
+        self._buffer = buffer
         self._warnings = warnings
         self._factory = RclpyMessages()
         self._moving: Publisher | None = None
-        self._fixed: Publisher | None = None
+        self._static: Publisher | None = None
+        self._published_static: set[tuple[str, str]] = set()
         try:
             message = message_class('tf2_msgs/msg/TFMessage')
-        except LookupError:
+        except MessageError:
             self.is_available = False
             return
         self.is_available = True
-        if hears:
-            node.create_subscription(message, '/tf_static', self._hear_fixed, HEAR_STATIC_QOS)
-        if hears_moving:
-            node.create_subscription(message, '/tf', self._hear_moving, TF_QOS)
-        if says:
+        if options.subscribes_tf_static:
+            node.create_subscription(message, '/tf_static', self._receive_static, SUBSCRIBE_STATIC_QOS)
+        if options.subscribes_tf:
+            node.create_subscription(message, '/tf', self._receive_moving, TF_QOS)
+        if options.publish_tf:
             self._moving = node.create_publisher(message, '/tf', TF_QOS)
-            self._fixed = node.create_publisher(message, '/tf_static', SAY_STATIC_QOS)
+            self._static = node.create_publisher(message, '/tf_static', PUBLISH_STATIC_QOS)
 
-    def move(self, stamp_ns: int, transforms: Mapping[tuple[str, str], Matrix]) -> None:
+    def publish(self, stamp_ns: int, transforms: Mapping[tuple[str, str], Matrix]) -> None:
         """Publish ``T_parent_child`` of each (parent, child) on ``/tf``."""
         self._publish(self._moving, stamp_ns, transforms)
 
-    def fix(self, stamp_ns: int, transforms: Mapping[tuple[str, str], Matrix]) -> None:
-        """Publish ``T_parent_child`` of each (parent, child) on ``/tf_static``, instead of what was."""
-        self._publish(self._fixed, stamp_ns, transforms)
+    def publish_static(self, stamp_ns: int, transforms: Mapping[tuple[str, str], Matrix]) -> None:
+        """Publish ``T_parent_child`` of each (parent, child) on ``/tf_static``, if the set of links has changed."""
+        if transforms.keys() != self._published_static:
+            self._publish(self._static, stamp_ns, transforms)
+            self._published_static = set(transforms)
 
     def _publish(self, publisher: Publisher | None, stamp_ns: int, transforms: Mapping[tuple[str, str], Matrix]) -> None:
         if publisher is not None and transforms and self._node.context.ok():
@@ -83,26 +82,24 @@ class Tf:
             ]
             publisher.publish(self._factory.make('tf2_msgs/msg/TFMessage', transforms=messages))
 
-    def _hear_fixed(self, message: Any) -> None:
+    def _receive_static(self, message: Any) -> None:
         for transform in message.transforms:
             if (T := self._matrix(transform)) is not None:
-                self._tree.fix(_name(transform.header.frame_id), _name(transform.child_frame_id), T)
+                self._buffer.set_static(_name(transform.header.frame_id), _name(transform.child_frame_id), T)
 
-    def _hear_moving(self, message: Any) -> None:
+    def _receive_moving(self, message: Any) -> None:
         for transform in message.transforms:
             if (T := self._matrix(transform)) is not None:
-                self._tree.move(
-                    _name(transform.header.frame_id), _name(transform.child_frame_id),
-                    stamps.message_stamp_ns(transform), T,
-                )  # fmt: skip
+                parent, child = _name(transform.header.frame_id), _name(transform.child_frame_id)
+                self._buffer.add(parent, child, stamps.message_stamp_ns(transform), T)
 
     def _matrix(self, transform: Any) -> Matrix | None:
         try:
             return poses.transform_matrix(transform.transform)
         except MessageError as error:
-            self._warnings.warn('tf', f"transform of '{transform.child_frame_id}' left out: {error}")
+            self._warnings.warn('tf', f"the transform of '{transform.child_frame_id}' is ignored: {error}")
             return None
 
 
 def _name(frame_id: str) -> str:
-    return frame_id.removeprefix('/')  # as tf2 does; ROS 1's bags still have it
+    return frame_id.removeprefix('/')  # as tf2 does; recordings of ROS 1 still have the slash

@@ -1,21 +1,19 @@
-"""``/diagnostics``: once a second, what the node gets, does and gives; read by rqt_robot_monitor and by robots.
+"""Publishes ``/diagnostics``: input, tracking, processing and map, for rqt_robot_monitor and for robots.
 
-Each report is made of two samples of the node's counters, a second apart; rates are over that second.
+Each report is computed from two samples of the node's counters. Rates are per second of the time between them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from msg_adapters import stamps
-from msg_adapters.factory import MessageFactory, RclpyMessages
+from msg_adapters.factory import MessageFactory, RclpyMessages, message_class
 from splatam_core.types import FrameResult, Status
-from splatam_ros.player.recording import message_class
 
 OK, WARN, ERROR = b'\x00', b'\x01', b'\x02'
 TYPE_NAME = 'diagnostic_msgs/msg/DiagnosticArray'
@@ -25,13 +23,13 @@ QOS_DEPTH = 10
 
 @dataclass(frozen=True, slots=True)
 class InputSample:
-    """Of one subscription.
+    """Counters of one subscription.
 
     Attributes:
-        topic: as resolved.
-        received: messages since the start.
-        publishers: on the graph.
-        delay_s: from the newest message's stamp to its arrival; None before the first.
+        topic: resolved name.
+        received: number of messages since the start.
+        publishers: number of publishers on the graph.
+        delay_s: time from the newest message's stamp to its arrival; None before the first message.
     """
 
     topic: str
@@ -42,21 +40,22 @@ class InputSample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """The node's counters at one moment.
+    """The node's counters at one time.
 
     Attributes:
-        monotonic_s: when.
-        inputs: subscriptions.
-        unpaired: images dropped without ever becoming a frame.
-        waiting_frames: frames that wait for SLAM.
-        dropped_frames: frames let go because SLAM was busy.
-        refused_frames: frames that could not be used.
-        frames: by what became of them.
-        poses: published.
-        delay_s: from the newest pose's stamp to its publication; None before the first.
-        result: of the newest frame; None before the first.
-        rss_mb: memory of the process; None where it is not known.
-        trouble: why no frames come; empty where they do.
+        monotonic_s: time of the sample.
+        inputs: the subscriptions.
+        unpaired: number of images dropped because no partner came.
+        waiting_frames: number of frames that wait for SLAM, or are being processed.
+        dropped_frames: number of frames dropped because SLAM was busy.
+        refused_frames: number of frames that SLAM could not use.
+        frames: number of processed frames by status.
+        poses: number of poses published.
+        delay_s: time from the newest pose's stamp to its publication; None before the first pose.
+        result: result of the newest frame; None before the first frame.
+        rss_mb: memory of the process; None if it is not known.
+        problem: why no frames are received; empty while they are.
+        camera_frame: coordinate frame of the camera; empty before the first frame.
     """
 
     monotonic_s: float
@@ -70,34 +69,61 @@ class Sample:
     delay_s: float | None
     result: FrameResult | None
     rss_mb: float | None
-    trouble: str
+    problem: str
+    camera_frame: str
 
 
-class Monitor:
-    """Publishes ``/diagnostics`` by the steady clock, so also while sim time stands still."""
+class FrameCounters:
+    """Counts processed frames by outcome. The worker's thread counts, the executor's thread reads.
 
-    def __init__(self, node: Node, sample: Callable[[], Sample], camera_frame: Callable[[], str]) -> None:
-        """Start.
+    Attributes:
+        by_status: number of processed frames by status.
+        refused: number of frames that SLAM could not use.
+        newest: result of the newest frame; None before the first.
+        delay_s: time from the newest pose's stamp to its publication; None before the first pose.
+        frame_id: frame id of the newest frame's colour image; empty before the first.
+    """
+
+    def __init__(self) -> None:
+        self.by_status = dict.fromkeys(Status, 0)
+        self.refused = 0
+        self.newest: FrameResult | None = None
+        self.delay_s: float | None = None
+        self.frame_id = ''
+
+    @property
+    def total(self) -> int:
+        """Number of processed frames."""
+        return sum(self.by_status.values())
+
+    def add(self, result: FrameResult, frame_id: str) -> None:
+        """Count a processed frame."""
+        self.by_status[result.status] += 1
+        self.newest = result
+        self.frame_id = frame_id
+
+
+class DiagnosticsPublisher:
+    """Publishes reports about the time since the previous sample."""
+
+    def __init__(self, node: Node, first: Sample) -> None:
+        """Advertise the topic.
 
         Args:
-            node: to publish with.
-            sample: takes a sample of the node's counters.
-            camera_frame: gives the name of the camera's frame, the hardware id; empty before it is known.
+            node: the node that publishes.
+            first: sample with which the first report is compared.
         """
         self._node = node
-        self._take = sample
-        self._camera_frame = camera_frame
         self._factory = RclpyMessages()
-        self._before = sample()
+        self._before = first
         self._publisher = node.create_publisher(message_class(TYPE_NAME), '/diagnostics', QOS_DEPTH)
-        node.create_timer(PERIOD_S, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def _publish(self) -> None:
-        before, self._before = self._before, self._take()
-        found = reports(before, self._before)
+    def publish(self, now: Sample) -> None:
+        """Publish the reports about the time from the last sample to this one."""
+        before, self._before = self._before, now
         stamp_ns = self._node.get_clock().now().nanoseconds
-        hardware_id = self._camera_frame() or 'none'
-        self._publisher.publish(message(self._factory, found, stamp_ns, self._node.get_name(), hardware_id))
+        hardware_id = now.camera_frame or 'none'
+        self._publisher.publish(message(self._factory, reports(before, now), stamp_ns, self._node.get_name(), hardware_id))
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +131,7 @@ class Report:
     """One status of the array.
 
     Attributes:
-        name: what it is about; the message puts the node's name in front.
+        name: subject; the message puts the node's name in front.
         level: OK, WARN or ERROR.
         text: one line.
         values: details by name.
@@ -118,12 +144,12 @@ class Report:
 
 
 def reports(before: Sample, now: Sample) -> tuple[Report, ...]:
-    """What there is to say, given the counters now and a while ago."""
+    """Returns one report per subject, given the counters now and earlier."""
     return input_report(before, now), tracking_report(now), processing_report(before, now), map_report(now)
 
 
 def input_report(before: Sample, now: Sample) -> Report:
-    """What the camera sends."""
+    """Report on the images that are received."""
     seconds = now.monotonic_s - before.monotonic_s
     values: dict[str, str] = {}
     for old, new in zip(before.inputs, now.inputs):
@@ -132,23 +158,24 @@ def input_report(before: Sample, now: Sample) -> Report:
         values[f'{new.topic} publishers'] = str(new.publishers)
     values['images dropped without a partner'] = str(now.unpaired)
     unpaired = now.unpaired - before.unpaired
-    if now.trouble:
-        return Report('input', ERROR, f'no frames: {now.trouble}', values)
+    if now.problem:
+        return Report('input', ERROR, f'no frames: {now.problem}', values)
     if unpaired:
         return Report('input', WARN, f'{unpaired} images dropped without a partner', values)
-    return Report('input', OK, 'frames come' if sum(now.frames.values()) else 'waiting for the first frame', values)
+    has_frames = sum(now.frames.values()) > 0
+    return Report('input', OK, 'receiving frames' if has_frames else 'waiting for the first frame', values)
 
 
 def tracking_report(now: Sample) -> Report:
-    """Whether it is known where the camera is."""
+    """Report on whether the pose of the camera is known."""
     values = {f'frames {status.value}': str(count) for status, count in now.frames.items()}
     result = now.result
     if result is None:
         return Report('tracking', WARN, 'no frame yet', values)
     values |= {
         'status': result.status.value,
-        'share of the view that is mapped': f'{result.visible_fraction:.2f}',
-        'share of it that agrees with the map': f'{result.inlier_fraction:.2f}',
+        'visible fraction': f'{result.visible_fraction:.2f}',
+        'inlier fraction': f'{result.inlier_fraction:.2f}',
         'stamp': f'{result.stamp_ns / 1e9:.6f}',
     }
     if result.status is Status.LOST:
@@ -157,7 +184,7 @@ def tracking_report(now: Sample) -> Report:
 
 
 def processing_report(before: Sample, now: Sample) -> Report:
-    """Whether SLAM keeps up."""
+    """Report on whether SLAM is fast enough for the camera."""
     seconds = now.monotonic_s - before.monotonic_s
     done = sum(now.frames.values()) - sum(before.frames.values())
     dropped, refused = now.dropped_frames - before.dropped_frames, now.refused_frames - before.refused_frames
@@ -175,18 +202,18 @@ def processing_report(before: Sample, now: Sample) -> Report:
     if refused:
         return Report('processing', WARN, f'{refused} frames could not be used', values)
     if dropped:
-        return Report('processing', WARN, f'slower than the camera: {dropped} frames dropped', values)
-    return Report('processing', OK, f'{done / seconds:.1f} frames a second', values)
+        return Report('processing', WARN, f'SLAM is slower than the camera: {dropped} frames dropped', values)
+    return Report('processing', OK, f'{done / seconds:.1f} frames per second', values)
 
 
 def map_report(now: Sample) -> Report:
-    """How large the map is."""
+    """Report on the size of the map."""
     count = now.result.num_gaussians if now.result else 0
     return Report('map', OK, f'{count} Gaussians', {'Gaussians': str(count), 'memory (MB)': _number(now.rss_mb, 0)})
 
 
 def message(factory: MessageFactory, found: Sequence[Report], stamp_ns: int, node_name: str, hardware_id: str) -> Any:
-    """A ``diagnostic_msgs/DiagnosticArray``; names as diagnostic_updater makes them, ``node: what``."""
+    """Returns a ``diagnostic_msgs/DiagnosticArray``. Statuses are named ``NODE: SUBJECT``, as by diagnostic_updater."""
     return factory.make(
         TYPE_NAME,
         header=stamps.header(factory, stamp_ns, ''),

@@ -1,4 +1,4 @@
-"""Messages in, frames out: pairs, decodes and rectifies what the camera sends."""
+"""Assembles frames from messages: pairs, decodes and rectifies the camera's images."""
 
 from __future__ import annotations
 
@@ -15,31 +15,28 @@ from splatam_core.errors import CameraError, FrameError
 from splatam_core.geometry.camera import CameraCalibration
 from splatam_core.images.rectification import FrameFactory
 from splatam_core.types import RgbdFrame
-from splatam_ros.node.gate import Gate
+from splatam_ros.node.gate import FrameGate
 from splatam_ros.node.parameters import NodeOptions
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 T = TypeVar('T')
-FAR_APART_NS = 20_000_000  # as rtabmap_ros warns from
+LARGE_GAP_NS = 20_000_000  # rtabmap_ros warns from the same gap
 
 
-class Intake:
-    """Turns the three streams into frames. What cannot be used is left out with a warning; nothing raises.
+class FrameAssembler:
+    """Turns the three streams of a camera into frames. Unusable input is skipped with a warning; nothing raises."""
 
-    Attributes:
-        camera_frame: frame id of the camera of the newest frame.
-    """
-
-    def __init__(self, options: NodeOptions, warnings: ThrottledWarnings, gate: Gate, on_skipped: Callable[[int], None]) -> None:
-        """Prepare.
+    def __init__(
+        self, options: NodeOptions, warnings: ThrottledWarnings, gate: FrameGate, on_rejected: Callable[[int], None]
+    ) -> None:
+        """Start without messages.
 
         Args:
-            options: the node's.
-            warnings: where to say what is left out.
-            gate: asked for each frame before it is decoded.
-            on_skipped: called with the stamp (ns) of each frame that the gate does not let through.
+            options: the node's options.
+            warnings: receives a warning about each input that is skipped.
+            gate: decides about each frame before it is decoded.
+            on_rejected: called with the stamp (ns) of each frame that the gate rejects.
         """
-        self.camera_frame = ''
         self._synchronizer = RgbdSynchronizer(
             options.sync_mode, round(options.sync_max_interval * 1e9), options.sync_queue_size,
             round(options.time_jump_threshold * 1e9),
@@ -49,25 +46,25 @@ class Intake:
         self._decode_depth = partial(images.decode_depth, metres_per_count=options.depth_scale)
         self._warnings = warnings
         self._gate = gate
-        self._on_skipped = on_skipped
+        self._on_rejected = on_rejected
         self._factory: FrameFactory | None = None
         self._reported = self._synchronizer.statistics
 
     @property
     def statistics(self) -> SyncStatistics:
-        """Where the messages went."""
+        """Counts of received, paired and dropped messages."""
         return self._synchronizer.statistics
 
-    def color(self, message: Any) -> list[RgbdFrame]:
-        """Take a colour image; the frames it completes."""
+    def add_color(self, message: Any) -> list[RgbdFrame]:
+        """Add a colour image; returns the frames that it completes."""
         return self._frames(self._synchronizer.add_color(stamps.message_stamp_ns(message), message))
 
-    def depth(self, message: Any) -> list[RgbdFrame]:
-        """Take a depth image; the frames it completes."""
+    def add_depth(self, message: Any) -> list[RgbdFrame]:
+        """Add a depth image; returns the frames that it completes."""
         return self._frames(self._synchronizer.add_depth(stamps.message_stamp_ns(message), message))
 
-    def info(self, message: Any) -> list[RgbdFrame]:
-        """Take a CameraInfo; the frames that waited for the first. One that makes no sense changes nothing."""
+    def add_info(self, message: Any) -> list[RgbdFrame]:
+        """Add a CameraInfo; returns the frames that waited for the first one. An invalid one is ignored."""
         read = partial(camera_info.parameters, is_rectified=self._is_rectified)
         parameters = self._attempt('CameraInfo', read, message)
         if parameters is None:
@@ -75,22 +72,22 @@ class Intake:
         return self._frames(self._synchronizer.add_info(stamps.message_stamp_ns(message), parameters))
 
     def flush(self) -> list[RgbdFrame]:
-        """The frames that can be made if nothing more comes; what has no partner is dropped."""
+        """Returns the frames that can be assembled without further messages; unpaired images are dropped."""
         return self._frames(self._synchronizer.flush())
 
     def report_drops(self) -> None:
-        """Warn of what the synchronizer has dropped since the last report."""
+        """Warn about the messages that the synchronizer has dropped since the last report."""
         before, now = self._reported, self._synchronizer.statistics
         self._reported = now
-        self._report('duplicates', now.duplicates - before.duplicates, 'with a stamp that was there already')
+        self._report('duplicates', now.duplicates - before.duplicates, 'an image with the same stamp was received before')
         self._report('late', now.late - before.late, 'older than the last frame; do the stamps increase?')
-        self._report('color', now.unpaired_color - before.unpaired_color, f'(colour) without depth{_gap(now)}')
-        self._report('depth', now.unpaired_depth - before.unpaired_depth, f'(depth) without colour{_gap(now)}')
-        self._report('without info', now.without_info - before.without_info, 'with depth, but no CameraInfo has come')
+        self._report('color', now.unpaired_color - before.unpaired_color, f'colour without depth{_gap(now)}')
+        self._report('depth', now.unpaired_depth - before.unpaired_depth, f'depth without colour{_gap(now)}')
+        self._report('without info', now.without_info - before.without_info, 'paired, but no CameraInfo was received')
 
-    def _report(self, kind: str, count: int, what: str) -> None:
+    def _report(self, kind: str, count: int, why: str) -> None:
         if count > 0:
-            self._warnings.warn(f'dropped {kind}', f'{count} image{"s" if count > 1 else ""} dropped: {what}')
+            self._warnings.warn(f'dropped {kind}', f'{count} image{"s" if count > 1 else ""} dropped: {why}')
 
     def _frames(self, sets: list[RgbdSet]) -> list[RgbdFrame]:
         frames = [self._frame(found) for found in sets if self._is_admitted(found)]
@@ -99,7 +96,7 @@ class Intake:
     def _is_admitted(self, found: RgbdSet) -> bool:
         is_admitted = self._gate.admits(found.resets, found.stamp_ns)
         if not is_admitted:
-            self._on_skipped(found.stamp_ns)
+            self._on_rejected(found.stamp_ns)
         return is_admitted
 
     def _frame(self, found: RgbdSet) -> RgbdFrame | None:
@@ -108,13 +105,14 @@ class Intake:
         depth_m = self._attempt('depth', self._decode_depth, found.depth)
         if factory is None or rgb is None or depth_m is None:
             return None
-        self.camera_frame = found.info.frame_id or found.color.header.frame_id
-        self._warn_of_what_may_not_fit(found)
+        self._warn_of_mismatch(found)
         frame = self._attempt('frame', lambda stamp_ns: factory.make(stamp_ns, rgb, depth_m), found.stamp_ns)
-        return None if frame is None else replace(frame, epoch=found.resets)
+        if frame is None:
+            return None
+        return replace(frame, epoch=found.resets, frame_id=found.color.header.frame_id or found.info.frame_id)
 
-    def _warn_of_what_may_not_fit(self, found: RgbdSet) -> None:
-        if abs(found.gap_ns) > FAR_APART_NS:
+    def _warn_of_mismatch(self, found: RgbdSet) -> None:
+        if abs(found.gap_ns) > LARGE_GAP_NS:
             self._warnings.warn(
                 'gap', f'depth is {found.gap_ns / 1e9:+.3f} s from its colour: a moving camera will smear the map; '
                 'synchronize the two in the driver, or lower sync.max_interval',
@@ -133,10 +131,11 @@ class Intake:
         return self._factory
 
     def _attempt(self, what: str, function: Callable[[Any], T], argument: Any) -> T | None:
+        """Returns the function's result, or None after a warning if the input cannot be used."""
         try:
             return function(argument)
         except (MessageError, CameraError, FrameError) as error:
-            self._warnings.warn(what, f'{what} left out: {error}')
+            self._warnings.warn(what, f'{what} skipped: {error}')
             return None
 
 

@@ -1,4 +1,4 @@
-"""``splatam_node``: the process around the node; signals, shutdown order, exit codes."""
+"""``splatam_node``: the process of the node, with signals, order of shutdown and exit codes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
-from splatam_core.config import Setting
+from splatam_core.settings import Setting
 from splatam_core.errors import SplatamError
 from splatam_ros.node.node import SplatamNode
 from splatam_ros.node.parameters import NODE_SETTINGS
@@ -19,19 +19,19 @@ from splatam_ros.process import StopRequest, ros, split_arguments
 
 PROGRAM = 'splatam_node'
 EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
-STEP_S = 0.1  # longest time until a signal is noticed
+SPIN_S = 0.1  # longest time until a signal is noticed
 HELP_COLUMNS, HELP_INDENT = 100, '      '
 
 
 class RosLog(logging.Handler):
-    """Hands the core's log records to the node's logger."""
+    """Passes the core's log records to the node's logger."""
 
     def __init__(self, logger: RcutilsLogger) -> None:
         super().__init__()
         self._logger = logger
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Log a record at the ROS severity nearest to its own."""
+        """Log a record at the nearest ROS severity."""
         if record.levelno >= logging.ERROR:
             self._logger.error(record.getMessage())
         elif record.levelno >= logging.WARNING:
@@ -41,7 +41,7 @@ class RosLog(logging.Handler):
 
 
 def run(for_ros: Sequence[str], stop: StopRequest) -> int:
-    """Run the node until it is finished or a signal comes; returns the exit code.
+    """Run the node until it is finished or a signal arrives. Returns the exit code.
 
     Raises:
         SplatamError: the node cannot start.
@@ -54,7 +54,7 @@ def run(for_ros: Sequence[str], stop: StopRequest) -> int:
             executor = SingleThreadedExecutor()
             executor.add_node(node)
             while not (stop.requested or node.is_finished):
-                executor.spin_once(timeout_sec=STEP_S)
+                executor.spin_once(timeout_sec=SPIN_S)
             executor.remove_node(node)
         finally:
             is_fine = node.close(lambda: stop.requested)
@@ -62,7 +62,7 @@ def run(for_ros: Sequence[str], stop: StopRequest) -> int:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The parser of what is no ROS argument, which is nothing but ``--help``."""
+    """Returns the parser of the arguments that are not for ROS; there is only ``--help``."""
     lines = [
         f'  {setting.name} ({setting.default!r}{" " + setting.unit if setting.unit else ""})\n'
         + textwrap.fill(_help(setting), HELP_COLUMNS, initial_indent=HELP_INDENT, subsequent_indent=HELP_INDENT)
@@ -71,8 +71,8 @@ def make_parser() -> argparse.ArgumentParser:
     return argparse.ArgumentParser(
         PROGRAM,
         usage='%(prog)s [--ros-args -p NAME:=VALUE ... -r rgb/image:=/TOPIC ...]',
-        description='RGB-D SLAM on rgb/image, depth/image and rgb/camera_info.',
-        epilog='parameters (default), besides the SLAM settings below slam.:\n' + '\n'.join(lines),
+        description='RGB-D SLAM on the topics rgb/image, depth/image and rgb/camera_info.',
+        epilog='parameters (default); the SLAM settings have the prefix slam. and are not listed here:\n' + '\n'.join(lines),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
 
@@ -82,7 +82,7 @@ def _help(setting: Setting) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the node; returns the exit code: 0 in good order, 1 SLAM or saving failed, 2 cannot start."""
+    """Run the node. Returns the exit code: 0 = success, 1 = SLAM or saving failed, 2 = cannot start."""
     own, for_ros = split_arguments(sys.argv[1:] if arguments is None else arguments)
     make_parser().parse_args(own)
     with StopRequest() as stop:

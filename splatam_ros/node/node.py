@@ -1,14 +1,14 @@
-"""The node: parameters, subscriptions, the SLAM worker and what it publishes. Nothing slow runs in its callbacks."""
+"""The node: connects parameters, camera, SLAM worker and outputs. No callback does slow work on the executor's thread."""
 
 from __future__ import annotations
 
 import time
 import traceback
 from collections.abc import Callable
+from functools import partial
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from splatam_core.config import SlamConfig, apply_threads
 from splatam_core.errors import FrameError, SplatamError
@@ -17,35 +17,37 @@ from splatam_core.runs import provenance
 from splatam_core.slam import Slam
 from splatam_core.types import FrameResult, RgbdFrame, Status
 from splatam_core.worker import SlamWorker, WorkerStopped
-from splatam_ros.frames.geometry import Geometry
-from splatam_ros.node import parameters
-from splatam_ros.node.diagnostics import InputSample, Monitor, Sample
-from splatam_ros.node.frame_assembler import Intake
-from splatam_ros.node.gate import Gate
-from splatam_ros.node.input_watchdog import Silence
-from splatam_ros.node.map_lifecycle import Session
+from splatam_ros.frames.robot_frames import RobotFrames
+from splatam_ros.node import diagnostics, parameters
+from splatam_ros.node.camera_input import CameraInput
+from splatam_ros.node.diagnostics import DiagnosticsPublisher, FrameCounters, InputSample, Sample
+from splatam_ros.node.frame_assembler import FrameAssembler
+from splatam_ros.node.gate import FrameGate
+from splatam_ros.node.input_watchdog import InputWatchdog
+from splatam_ros.node.map_lifecycle import MapLifecycle
 from splatam_ros.node.outputs import Outputs
 from splatam_ros.node.parameters import NodeOptions
 from splatam_ros.node.reconfiguration import Reconfiguration
 from splatam_ros.node.services import Services
-from splatam_ros.subscription import Input, unused_overrides
+from splatam_ros.subscription import unused_overrides
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 TICK_S = 0.2
-QUIET_S = 1.0  # without an image: what can be paired by then is paired, and publishers that left are gone
-LONG_QUIET_S = 10.0  # the same where one more partner is due; a paused player may be about to send it
 PROGRESS_S = 10.0
-TRANSPORTS = {
-    'raw': ('', Image),
-    'compressed': ('/compressed', CompressedImage),
-    'compressedDepth': ('/compressedDepth', CompressedImage),
-}
+
+
+def _always() -> bool:
+    return True
 
 
 class SplatamNode(Node):
     """RGB-D images in; poses, renders and a Gaussian map out.
 
-    The executor's thread pairs and decodes; ``SlamWorker`` owns Slam, the run folder and the publishers.
+    The executor's thread pairs and decodes images. ``SlamWorker`` owns SLAM, the run folder and the publishers.
+
+    Attributes:
+        options: the node's parameters; some change at run time.
+        is_finished: True when the process should end: the recording is over, or SLAM failed.
     """
 
     def __init__(self) -> None:
@@ -56,180 +58,156 @@ class SplatamNode(Node):
         """
         super().__init__('splatam', automatically_declare_parameters_from_overrides=True)
         self.options, config = parameters.declare(self)
+        options, logger = self.options, self.get_logger()
         apply_threads(config)
         self.is_finished = False
-        self._warnings = ThrottledWarnings(self.get_logger())
-        self._gate = Gate(self.options.max_rate_hz)
-        self._geometry = Geometry(self, self.options, self._warnings, lambda: self._intake.camera_frame)
-        self._outputs = Outputs(self, self.options, self._geometry)
-        self._intake = Intake(self.options, self._warnings, self._gate, self._outputs.done)
-        self._slam = Slam(config, self._geometry.prior)
+        self._num_dropped = 0
+        self._progress_s = time.monotonic()
+        self._counters = FrameCounters()
+        self._warnings = ThrottledWarnings(logger)
+        self._frames = RobotFrames(
+            self, options.frames, self._warnings, reliability=options.input_reliability, keep_all=options.keeps_all
+        )
+        self._outputs = Outputs(self, options, self._frames)
+        self._lifecycle = MapLifecycle(options, config, logger, self._frames, self._outputs)
+        self._slam = Slam(config, self._frames.prior)
         if self._slam.backend.why:
-            self.get_logger().info(str(self._slam.backend))
-        self._session = Session(self.options, config, self.get_logger(), self._outputs)
-        if self.options.load_path:
-            self._session.load(self._slam)
-        self._inputs = self._subscribe()
+            logger.info(str(self._slam.backend))
+        if options.load_path:
+            self._lifecycle.load(self._slam)
+        self._gate = FrameGate(options.max_rate_hz)
+        assembler = FrameAssembler(options, self._warnings, self._gate, self._outputs.publish_processed)
+        self._camera = CameraInput(self, options, assembler, self._submit)
+        self._watchdog = InputWatchdog(self, self._camera.subscriptions)
         self._warn_of_unused_overrides()
-        self._silence = Silence(self, self._inputs)
-        self._counts = dict.fromkeys(Status, 0)
-        self._num_dropped = self._num_refused = 0
-        self._result: FrameResult | None = None
-        self._delay_s: float | None = None
-        self._heard_s = self._progress_s = time.monotonic()
-        self._had_publishers = False
-        self.create_timer(TICK_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        # Last, since a thread must be joined: nothing after this may fail.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # sim time may stand still
+        self.create_timer(TICK_S, self._tick, clock=steady)
+        self.create_timer(diagnostics.PERIOD_S, self._publish_diagnostics, clock=steady)
+        # Start the thread last: it must be joined, so nothing after it may fail before ``close``.
         self._worker = SlamWorker(
-            self._slam, self._on_result, self._on_bad_frame, queue_size=self.options.queue_size,
-            when_full='block' if self._keeps_all else 'drop_oldest', before_frame=self._session.before_frame,
+            self._slam, self._on_result, self._on_bad_frame, queue_size=options.queue_size,
+            when_full='block' if options.keeps_all else 'drop_oldest', before_frame=self._lifecycle.before_frame,
         )  # fmt: skip
-        self._controls = Services(self, self._worker, self._session, self._gate)
-        self._reconfiguration = Reconfiguration(self, self.options, config, self._use_options, self._use_config)
-        self.get_logger().info(
-            f"preset '{self.options.preset}', waiting for {', '.join(item.topic for item in self._inputs)}, "
-            + (f'saving to {self._session.folder}' if self._session.folder else 'saving nothing: save_path is empty')
-        )
-
-        self._monitor = Monitor(self, self._sample, lambda: self._geometry.camera_frame)
-
-    @property
-    def _keeps_all(self) -> bool:
-        return self.options.queue_policy == 'all'
-
-    def _subscribe(self) -> list[Input]:
-        rgb_suffix, rgb_class = TRANSPORTS[self.options.rgb_transport]
-        depth_suffix, depth_class = TRANSPORTS[self.options.depth_transport]
-        streams = (  # of messages that arrive together the executor takes the camera's first
-            (CameraInfo, 'rgb/camera_info', self._on_info),
-            (rgb_class, f'rgb/image{rgb_suffix}', self._on_color),
-            (depth_class, f'depth/image{depth_suffix}', self._on_depth),
-        )
-        return [
-            Input(
-                self, message_class, topic, on_message,
-                reliability=self.options.input_reliability, keep_all=self._keeps_all,
-            )
-            for message_class, topic, on_message in streams
-        ]  # fmt: skip
+        self._service_server = Services(self, self._worker, self._lifecycle, self._gate)
+        self._reconfiguration = Reconfiguration(self, options, config, self._use_options, self._use_config)
+        self._diagnostics = DiagnosticsPublisher(self, self._sample())
+        folder = self._lifecycle.folder
+        saving = f'saving to {folder}' if folder else 'saving nothing: save_path is empty'
+        logger.info(f"preset '{options.preset}', waiting for {', '.join(self._camera.topics)}, {saving}")
 
     def _warn_of_unused_overrides(self) -> None:
-        odometry = [self._geometry.odometry.input] if self._geometry.odometry else []
-        topics = [item.topic for item in (*self._inputs, *odometry)]
+        odometry = [self._frames.odometry.topic] if self._frames.odometry else []
+        topics = [*self._camera.topics, *odometry]
         for name in unused_overrides(self, topics):
             self.get_logger().warning(
-                f"parameter '{name}' overrides nothing; expected qos_overrides.TOPIC.subscription.POLICY, "
+                f"parameter '{name}' has no effect; expected qos_overrides.TOPIC.subscription.POLICY, "
                 f'TOPIC one of {", ".join(topics)}'
             )
 
-    # --- executor thread ---
+    # --- executor's thread ---
 
-    def _on_info(self, message: CameraInfo) -> None:
-        self._supply(self._intake.info(message))
-
-    def _on_color(self, message: Image | CompressedImage) -> None:
-        self._supply(self._intake.color(message))
-        self._heard_s = time.monotonic()  # after supplying, which may have waited for SLAM
-
-    def _on_depth(self, message: Image | CompressedImage) -> None:
-        self._supply(self._intake.depth(message))
-        self._heard_s = time.monotonic()
-
-    def _supply(self, frames: list[RgbdFrame]) -> None:
-        for frame in frames:
-            try:
-                self._worker.submit(frame)
-            except WorkerStopped:  # why is said when the node closes
-                self.is_finished = True
-                return
-            self._silence.end()
+    def _submit(self, frame: RgbdFrame) -> None:
+        try:
+            self._worker.submit(frame)
+        except WorkerStopped:  # ``close`` logs the cause
+            self.is_finished = True
+        else:
+            self._watchdog.report_frame()
 
     def _tick(self) -> None:
-        quiet_s = time.monotonic() - self._heard_s
         if self._worker.pending:
-            self._silence.postpone()
-        elif self._stalls_on_lookahead(quiet_s):
-            self._supply(self._intake.flush())
-        elif self._outputs.is_behind:
-            self._worker.call(lambda slam: self._outputs.catch_up())
+            self._watchdog.postpone()
+        elif self._camera.is_stalled:
+            self._camera.flush()
+        elif self._outputs.has_late_subscriber:
+            self._worker.call(self._outputs.serve_late_subscribers)
         self._report_drops()
-        self._silence.check(self._intake.statistics, self.options)
-        self._check_end(quiet_s)
-
-    def _stalls_on_lookahead(self, quiet_s: float) -> bool:
-        """Whether images wait for a better partner that will not come: a player may be waiting for us."""
-        waiting = self._intake.statistics
-        if not (waiting.waiting_color and waiting.waiting_depth):
-            return False
-        return quiet_s > (QUIET_S if waiting.waiting_color == waiting.waiting_depth else LONG_QUIET_S)
+        self._watchdog.check(self._camera.statistics, self.options)
+        self._check_end()
 
     def _report_drops(self) -> None:
-        self._intake.report_drops()
+        self._camera.report_drops()
         dropped = self._worker.dropped
         if dropped > self._num_dropped:
             self._warnings.warn(
                 'dropped', f'SLAM is slower than the camera: {dropped} frames dropped so far; '
-                'queue_policy all keeps every frame of a recording',
+                'set queue_policy to all to keep every frame of a recording',
             )  # fmt: skip
         self._num_dropped = dropped
 
-    def _check_end(self, quiet_s: float) -> None:
-        """Finish when the worker broke down, or the image publishers have left and all of theirs is processed."""
-        images = self._inputs[1:]
-        has_publishers = any(item.num_publishers for item in images)
-        # Publishers may have come and gone while the executor waited for SLAM; their images were received then.
-        self._had_publishers |= has_publishers or any(item.received for item in images)
+    def _check_end(self) -> None:
+        """Finish if the worker failed, or if the image publishers have left and everything is processed."""
+        has_ended = self._camera.has_ended
         if self._worker.error is not None:
             self.is_finished = True
-        elif self.options.exit_on_publisher_end and self._had_publishers and not has_publishers and quiet_s > QUIET_S:
-            self._supply(self._intake.flush())
+        elif self.options.exit_on_publisher_end and has_ended:
+            self._camera.flush()
             self.is_finished |= self._worker.pending == 0
 
+    def _publish_diagnostics(self) -> None:
+        self._diagnostics.publish(self._sample())
+
     def _sample(self) -> Sample:
-        waiting = self._intake.statistics
-        inputs = [InputSample(item.topic, item.received, item.num_publishers, item.delay_s) for item in self._inputs]
+        statistics = self._camera.statistics
         return Sample(
-            time.monotonic(), inputs, waiting.unpaired_color + waiting.unpaired_depth, self._worker.pending,
-            self._worker.dropped, self._num_refused, dict(self._counts), self._outputs.num_poses, self._delay_s,
-            self._result, provenance.rss_mb(),
-            self._silence.why,
-        )  # fmt: skip
+            monotonic_s=time.monotonic(),
+            inputs=[
+                InputSample(item.topic, item.received, item.num_publishers, item.delay_s) for item in self._camera.subscriptions
+            ],
+            unpaired=statistics.unpaired_color + statistics.unpaired_depth,
+            waiting_frames=self._worker.pending,
+            dropped_frames=self._worker.dropped,
+            refused_frames=self._counters.refused,
+            frames=dict(self._counters.by_status),
+            poses=self._outputs.num_poses,
+            delay_s=self._counters.delay_s,
+            result=self._counters.newest,
+            rss_mb=provenance.rss_mb(),
+            problem=self._watchdog.problem,
+            camera_frame=self._frames.camera_frame(self._counters.frame_id),
+        )
 
     def _use_options(self, options: NodeOptions) -> None:
-        self.options = self._session.options = options
+        self.options = options
+        self._lifecycle.use(options)
         self._gate.max_rate_hz = options.max_rate_hz
         self._outputs.use(options)
 
     def _use_config(self, config: SlamConfig) -> None:
-        self._worker.call(lambda slam: slam.configure(config))
+        def configure(slam: Slam) -> None:
+            slam.configure(config)
 
-    def close(self, is_hurried: Callable[[], bool] = lambda: True) -> bool:
-        """Take no more messages, finish what waits, save, destroy. Whether all went well.
+        self._worker.call(configure)
+
+    def close(self, is_hurried: Callable[[], bool] = _always) -> bool:
+        """Stop receiving, process what waits, save, and destroy the node.
 
         Args:
-            is_hurried: whether somebody waits for the end, and may kill the process.
+            is_hurried: returns True if someone waits for the process to end, and may kill it.
+
+        Returns:
+            True if SLAM did not fail and everything was saved.
         """
-        for item in self._inputs:
-            item.close()
-        if self._keeps_all:
-            self._supply(self._intake.flush())
-        is_fine = self._attempt('SLAM', lambda: self._worker.stop(drain=self._keeps_all))
+        self._camera.close()
+        if self.options.keeps_all:
+            self._camera.flush()
+        is_fine = self._attempt('SLAM', partial(self._worker.stop, drain=self.options.keeps_all))
         self._report_drops()
         if self.options.folder is not None and self.options.save_on_shutdown:
             if self._worker.error is None:
-                is_fine &= self._attempt('fitting the map once more', lambda: self._session.fit(self._slam, is_hurried))
-            is_fine &= self._attempt('saving', lambda: self._session.finish(self._slam))
-        is_fine &= self._attempt('saving', self._session.close)
+                is_fine &= self._attempt('the final fit of the map', partial(self._lifecycle.finish, self._slam, is_hurried))
+            is_fine &= self._attempt('saving', partial(self._lifecycle.save_at_end, self._slam))
+        is_fine &= self._attempt('saving', self._lifecycle.close)
         self.destroy_node()
         return is_fine
 
     def _attempt(self, what: str, action: Callable[[], object]) -> bool:
-        """Do something that must not keep the rest of the shutdown from happening."""
+        """Run a step of the shutdown. If it fails, log the error; the other steps run all the same."""
         try:
             action()
         except (SplatamError, OSError) as error:
             self.get_logger().error(f'{what} failed: {error}')
-        except Exception as error:  # noqa: BLE001 - the rest of the shutdown is to happen
+        except Exception as error:  # noqa: BLE001 - the rest of the shutdown must run
             self.get_logger().error(f'{what} failed:\n{"".join(traceback.format_exception(error))}')
         else:
             return True
@@ -238,27 +216,26 @@ class SplatamNode(Node):
     # --- worker's thread ---
 
     def _on_result(self, frame: RgbdFrame, result: FrameResult) -> None:
-        self._session.record(frame, result)  # before anybody hears of the frame: what was answered is on disk
-        self._counts[result.status] += 1
+        self._lifecycle.record(frame, result)  # before publishing: a frame that was answered is on disk
+        self._counters.add(result, frame.frame_id)
         if result.status is Status.LOST:
             self._warnings.warn('lost', f'lost at {stamp_text(result.stamp_ns)}: {result.reason}')
-        self._result = result
-        self._outputs.publish(result, self._slam)
+        self._outputs.publish(result, self._lifecycle.locate(frame, result), self._slam)
         if result.T_world_cam is not None:
-            self._delay_s = (self.get_clock().now().nanoseconds - result.stamp_ns) / 1e9
+            self._counters.delay_s = (self.get_clock().now().nanoseconds - result.stamp_ns) / 1e9
         self._log_progress(result)
-        self._session.after_frame(self._slam, result)
+        self._lifecycle.after_frame(self._slam, result)
 
     def _on_bad_frame(self, frame: RgbdFrame, error: FrameError) -> None:
-        self._num_refused += 1
-        self._warnings.warn('refused', f'frame {stamp_text(frame.stamp_ns)} left out: {error}')
-        self._outputs.done(frame.stamp_ns)
+        self._counters.refused += 1
+        self._warnings.warn('refused', f'frame {stamp_text(frame.stamp_ns)} skipped: {error}')
+        self._outputs.publish_processed(frame.stamp_ns)
 
     def _log_progress(self, result: FrameResult) -> None:
         is_first = result.status is Status.INITIALIZED
         if is_first or time.monotonic() - self._progress_s > PROGRESS_S:
             self._progress_s = time.monotonic()
             self.get_logger().info(
-                f'{sum(self._counts.values())} frames, {self._counts[Status.LOST]} lost, '
+                f'{self._counters.total} frames, {self._counters.by_status[Status.LOST]} lost, '
                 f'{result.num_gaussians} Gaussians, {result.timings.total:.0f} ms for this frame'
             )

@@ -1,4 +1,4 @@
-"""What the node publishes: a table, one row a topic. A new output is a function and a row."""
+"""The topics that the node publishes, as a table. To add one, write a function and add a row to ``OUTPUTS``."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from msg_adapters import images, point_clouds, poses, stamps
-from msg_adapters.factory import MessageFactory, RclpyMessages
+from msg_adapters.factory import MessageFactory, RclpyMessages, message_class
 from splatam_core.slam import Slam
 from splatam_core.types import FrameResult, RenderedView
 from splatam_ros.frames.covariance import Motion, MotionEstimator
-from splatam_ros.frames.geometry import Geometry
 from splatam_ros.frames.rep105 import Located
+from splatam_ros.frames.robot_frames import RobotFrames
 from splatam_ros.node.parameters import NodeOptions
-from splatam_ros.player.recording import message_class
 
 Matrix = NDArray[np.float64]
 
@@ -38,15 +37,25 @@ LATCHED_QOS = _qos(1, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Trigger(Enum):
-    """When an output is due."""
+    """When an output is published."""
 
     POSE = 'with every pose'
-    LISTENER = 'with every pose, when somebody listens, at most at its rate'
+    SUBSCRIBED = 'with every pose while someone subscribes, limited by its rate'
 
 
-@dataclass
-class Moment:
-    """A tracked frame, and what can be made of it; made when first asked for."""
+@dataclass(eq=False)
+class PublishContext:
+    """A tracked frame and everything that messages about it are made of. Costly parts are made when first used.
+
+    Attributes:
+        located: the camera in the coordinate frames of ROS.
+        T_world_cam: [4, 4] camera to the core's world.
+        motion: velocity and covariances.
+        slam: SLAM in its state after the frame; the map may be rendered.
+        path: all poses so far.
+        options: the node's options.
+        factory: makes the messages.
+    """
 
     located: Located
     T_world_cam: Matrix
@@ -58,18 +67,32 @@ class Moment:
 
     @property
     def stamp_ns(self) -> int:
-        """Of the frame."""
+        """Stamp of the frame."""
         return self.located.stamp_ns
+
+    @property
+    def map_frame(self) -> str:
+        """Coordinate frame of poses and map."""
+        return self.options.map_frame
+
+    @property
+    def camera_frame(self) -> str:
+        """Coordinate frame of the camera's images."""
+        return self.located.camera_frame
 
     @cached_property
     def view(self) -> RenderedView:
-        """The map as the camera should see it; one render serves all three images."""
+        """The map rendered from the camera's pose; one render serves all three images."""
         return self.slam.render(self.T_world_cam)
 
     @cached_property
     def pose(self) -> Any:
-        """The camera in the map, as a message; the path is made of these."""
-        return poses.pose_stamped(self.factory, self.located.T_map_camera, self.stamp_ns, self.options.map_frame)
+        """The camera in the map, as a ``PoseStamped`` message; the path consists of these."""
+        return poses.pose_stamped(self.factory, self.located.T_map_camera, self.stamp_ns, self.map_frame)
+
+
+def _no_limit(options: NodeOptions) -> float:
+    return 0.0
 
 
 @dataclass(frozen=True)
@@ -77,85 +100,97 @@ class Output:
     """A row of the table.
 
     Attributes:
-        topic: below the node's name.
+        topic: name below the node's name.
         type_name: e.g. ``nav_msgs/msg/Path``.
-        qos: of the publisher.
-        trigger: when it is due.
+        qos: QoS of the publisher.
+        trigger: when it is published.
         message: makes the message.
-        help: what it is, for the documentation.
-        rate: gives the most messages a second, 0 = no limit.
+        help: one line for the documentation.
+        rate_hz: returns the largest number of messages per second, 0 = no limit.
     """
 
     topic: str
     type_name: str
     qos: QoSProfile
     trigger: Trigger
-    message: Callable[[Moment], Any]
+    message: Callable[[PublishContext], Any]
     help: str
-    rate: Callable[[NodeOptions], float] = lambda options: 0.0
+    rate_hz: Callable[[NodeOptions], float] = _no_limit
 
 
-def _pose(moment: Moment) -> Any:
-    return moment.pose
+def _pose(context: PublishContext) -> Any:
+    return context.pose
 
 
-def _odometry(moment: Moment) -> Any:
-    located, motion = moment.located, moment.motion
+def _odometry(context: PublishContext) -> Any:
+    located, motion = context.located, context.motion
     return poses.odometry(
-        moment.factory, located.T_map_body, moment.stamp_ns, moment.options.map_frame, located.body_frame,
+        context.factory, located.T_map_body, context.stamp_ns, context.map_frame, located.body_frame,
         pose_covariance=motion.pose_covariance, twist=motion.twist, twist_covariance=motion.twist_covariance,
     )  # fmt: skip
 
 
-def _path(moment: Moment) -> Any:
-    return poses.path(moment.factory, moment.path.poses, moment.stamp_ns, moment.options.map_frame)
+def _path(context: PublishContext) -> Any:
+    return poses.path(context.factory, context.path.poses, context.stamp_ns, context.map_frame)
 
 
-def _rgb(moment: Moment) -> Any:
-    return images.color_message(moment.factory, moment.view.rgb, moment.stamp_ns, moment.located.camera_frame)
+def _rgb(context: PublishContext) -> Any:
+    return images.color_message(context.factory, context.view.rgb, context.stamp_ns, context.camera_frame)
 
 
-def _depth(moment: Moment) -> Any:
-    return images.depth_message(moment.factory, moment.view.depth_m, moment.stamp_ns, moment.located.camera_frame)
+def _depth(context: PublishContext) -> Any:
+    return images.depth_message(context.factory, context.view.depth_m, context.stamp_ns, context.camera_frame)
 
 
-def _silhouette(moment: Moment) -> Any:
-    gray = np.rint(np.clip(moment.view.silhouette, 0, 1) * 255).astype(np.uint8)
-    return images.mono_message(moment.factory, gray, moment.stamp_ns, moment.located.camera_frame)
+def _silhouette(context: PublishContext) -> Any:
+    gray = np.rint(np.clip(context.view.silhouette, 0, 1) * 255).astype(np.uint8)
+    return images.mono_message(context.factory, gray, context.stamp_ns, context.camera_frame)
 
 
-def _cloud(moment: Moment) -> Any:
-    snapshot = moment.slam.snapshot()
+def _cloud(context: PublishContext) -> Any:
+    snapshot = context.slam.snapshot()
     count = len(snapshot.means)
-    kept = np.linspace(0, count - 1, min(count, moment.options.max_cloud_points)).astype(np.int64)
+    kept = np.linspace(0, count - 1, min(count, context.options.max_cloud_points)).astype(np.int64)
     rgb = np.rint(np.clip(snapshot.rgb[kept], 0, 1) * 255).astype(np.uint8)
-    R, t = (part.astype(np.float32) for part in (moment.located.T_map_world[:3, :3], moment.located.T_map_world[:3, 3]))
+    T_map_world = context.located.T_map_world
+    R, t = T_map_world[:3, :3].astype(np.float32), T_map_world[:3, 3].astype(np.float32)
     extra = {'opacity': snapshot.opacities[kept], 'radius': np.exp(snapshot.log_scales[kept].max(axis=1))}
-    return point_clouds.cloud_message(
-        moment.factory, snapshot.means[kept] @ R.T + t, rgb, moment.stamp_ns, moment.options.map_frame, extra
-    )
+    points = snapshot.means[kept] @ R.T + t  # [N, 3] in the map
+    return point_clouds.cloud_message(context.factory, points, rgb, context.stamp_ns, context.map_frame, extra)
+
+
+def _path_rate(options: NodeOptions) -> float:
+    return options.publish_rate_path
+
+
+def _render_rate(options: NodeOptions) -> float:
+    return options.publish_rate_render
+
+
+def _cloud_rate(options: NodeOptions) -> float:
+    return options.publish_rate_cloud
 
 
 OUTPUTS = (
-    Output('pose', 'geometry_msgs/msg/PoseStamped', POSE_QOS, Trigger.POSE, _pose, 'the camera in the map'),
+    Output('pose', 'geometry_msgs/msg/PoseStamped', POSE_QOS, Trigger.POSE, _pose, 'pose of the camera in the map'),
     Output('odometry', 'nav_msgs/msg/Odometry', POSE_QOS, Trigger.POSE, _odometry,
-           'the base, or without one the camera, in the map; with velocity and covariance, see below'),
-    Output('path', 'nav_msgs/msg/Path', LATCHED_QOS, Trigger.LISTENER, _path,
-           'all poses so far, thinned out evenly beyond `max_path_poses`; latched', lambda o: o.publish_rate_path),
-    Output('render/rgb', 'sensor_msgs/msg/Image', IMAGE_QOS, Trigger.LISTENER, _rgb,
-           'the map as the camera should see it', lambda o: o.publish_rate_render),
-    Output('render/depth', 'sensor_msgs/msg/Image', IMAGE_QOS, Trigger.LISTENER, _depth,
-           'its depth, 32FC1, metres; 0 where the silhouette is below 0.5', lambda o: o.publish_rate_render),
-    Output('render/silhouette', 'sensor_msgs/msg/Image', IMAGE_QOS, Trigger.LISTENER, _silhouette,
-           'how sure the map is, mono8', lambda o: o.publish_rate_render),
-    Output('map/points', 'sensor_msgs/msg/PointCloud2', LATCHED_QOS, Trigger.LISTENER, _cloud,
-           'centres of the Gaussians, x y z rgb opacity radius, evenly thinned out beyond `max_cloud_points`; latched',
-           lambda o: o.publish_rate_cloud),
+           'pose of the base (of the camera, if there is no base) in the map, with velocity and covariances; see below'),
+    Output('path', 'nav_msgs/msg/Path', LATCHED_QOS, Trigger.SUBSCRIBED, _path,
+           'all poses so far, thinned out evenly beyond `max_path_poses`; latched', rate_hz=_path_rate),
+    Output('render/rgb', 'sensor_msgs/msg/Image', IMAGE_QOS, Trigger.SUBSCRIBED, _rgb,
+           'the map rendered from the pose of the camera', rate_hz=_render_rate),
+    Output('render/depth', 'sensor_msgs/msg/Image', IMAGE_QOS, Trigger.SUBSCRIBED, _depth,
+           'depth of that render, 32FC1 in metres; 0 where the silhouette is below 0.5', rate_hz=_render_rate),
+    Output('render/silhouette', 'sensor_msgs/msg/Image', IMAGE_QOS, Trigger.SUBSCRIBED, _silhouette,
+           'silhouette of that render, mono8: 255 where the map covers the pixel', rate_hz=_render_rate),
+    Output('map/points', 'sensor_msgs/msg/PointCloud2', LATCHED_QOS, Trigger.SUBSCRIBED, _cloud,
+           'centres of the Gaussians with x y z rgb opacity radius, thinned out evenly beyond `max_cloud_points`; latched',
+           rate_hz=_cloud_rate),
 )  # fmt: skip
 
 
 class PathHistory:
-    """All poses so far, as messages, thinned out evenly once there are too many; the newest is always there."""
+    """All poses so far, as messages. Beyond a maximum they are thinned out evenly; the newest is always included."""
 
     def __init__(self, max_poses: int) -> None:
         self._max_poses = max_poses
@@ -165,12 +200,12 @@ class PathHistory:
         self._newest: Any = None
 
     def append(self, pose: Any) -> None:
-        """Take a pose."""
+        """Add a pose."""
         self._newest = pose
         if self._count % self._stride == 0:
             self._kept.append(pose)
         self._count += 1
-        if len(self._kept) >= self._max_poses:  # the newest may come on top
+        if len(self._kept) >= self._max_poses:  # ``poses`` may add the newest
             self._kept = self._kept[::2]
             self._stride *= 2
 
@@ -182,91 +217,106 @@ class PathHistory:
 
 
 class Outputs:
-    """The publishers of a node. Publishing belongs to the worker's thread.
+    """The publishers of a node. Publishes only; ``MapLifecycle`` decides about maps and time.
+
+    ``publish_processed`` and ``use`` may be called from any thread, everything else from the worker's thread.
 
     Attributes:
-        num_poses: poses published so far.
+        num_poses: number of poses published so far.
     """
 
-    def __init__(self, node: Node, options: NodeOptions, geometry: Geometry) -> None:
+    def __init__(self, node: Node, options: NodeOptions, frames: RobotFrames) -> None:
+        """Advertise every topic.
+
+        Args:
+            node: the node that publishes.
+            options: the node's options.
+            frames: publish the transforms.
+        """
         self.num_poses = 0
         self._node = node
         self._options = options
-        self._geometry = geometry
+        self._frames = frames
         self._factory = RclpyMessages()
         self._publishers = [(output, self._create(output.type_name, output.topic, output.qos)) for output in OUTPUTS]
         self._processed = self._create('std_msgs/msg/Header', 'processed', POSE_QOS)
-        self.forget()
+        self.begin_map()
 
     def use(self, options: NodeOptions) -> None:
-        """Take other rates and limits from now on; for any thread."""
+        """Apply changed rates and limits."""
         self._options = options
 
-    def forget(self) -> None:
-        """Start anew: poses and map so far have nothing to do with those to come."""
-        self._geometry.frames.reset()
+    def begin_map(self) -> None:
+        """Start a new map: drop the path, the velocity and what late subscribers would be sent."""
         self._path = PathHistory(self._options.max_path_poses)
         self._motion = MotionEstimator(self._options.stddev_position, self._options.stddev_orientation)
-        self._moment: Moment | None = None
+        self._newest: PublishContext | None = None
         self._due_s: dict[str, float] = {}
-        self._said_ns: dict[str, int] = {}
+        self._published_ns: dict[str, int] = {}
 
-    def interrupt(self) -> None:
-        """The next pose is of another time: there is no velocity from the last one to it."""
-        self._motion.lost()
+    def interrupt_motion(self) -> None:
+        """Report no velocity between the last pose and the next one, e.g. because time jumped."""
+        self._motion.interrupt()
 
-    def publish(self, result: FrameResult, slam: Slam) -> None:
-        """Publish what is due for a frame, all with its stamp; of a lost frame only that it is done.
+    def publish(self, result: FrameResult, located: Located | None, slam: Slam) -> None:
+        """Publish what is due for a frame, all with its stamp. Of a frame without a pose publish only ``~/processed``.
 
         Args:
-            result: of the frame.
-            slam: as it is after the frame.
+            result: result of the frame.
+            located: its camera in the coordinate frames of ROS; None if that is not known.
+            slam: SLAM in its state after the frame.
         """
         if result.T_world_cam is None:
-            self._motion.lost()
-        elif self._node.context.ok():
-            located = self._geometry.frames.locate(result.stamp_ns, result.T_world_cam, self._geometry.camera_frame)
-            if located is not None:
-                self._publish(located, result, slam)
-        self.done(result.stamp_ns)
+            self._motion.interrupt()
+        elif located is not None and self._node.context.ok():
+            self._publish_pose(located, result.T_world_cam, result, slam)
+        self.publish_processed(result.stamp_ns)
 
-    def done(self, stamp_ns: int) -> None:
-        """Say on ``~/processed`` that nothing more will come of the frame of this stamp."""
+    def publish_processed(self, stamp_ns: int) -> None:
+        """Announce on ``~/processed`` that nothing more will be published for the frame of this stamp."""
         if self._node.context.ok():
             self._processed.publish(stamps.header(self._factory, stamp_ns, self._options.map_frame))
 
     @property
-    def is_behind(self) -> bool:
-        """Whether somebody listens to a latched topic who has not been told the newest."""
-        moment, now_s = self._moment, time.monotonic()
-        return moment is not None and any(
+    def has_late_subscriber(self) -> bool:
+        """True if a latched topic has a subscriber but its newest message was not published."""
+        newest, now_s = self._newest, time.monotonic()
+        return newest is not None and any(
             output.qos is LATCHED_QOS
-            and self._said_ns.get(output.topic) != moment.stamp_ns
+            and self._published_ns.get(output.topic) != newest.stamp_ns
             and self._is_due(output, publisher, now_s)
             for output, publisher in self._publishers
         )
 
-    def catch_up(self) -> None:
-        """Tell them: they may have come after the last frame."""
-        if self._moment is not None and self._node.context.ok() and self.is_behind:
-            self._publish_due(self._moment, [row for row in self._publishers if row[0].qos is LATCHED_QOS])
+    def serve_late_subscribers(self, slam: Slam) -> None:
+        """Publish the newest message of each latched topic that someone subscribed to after the last frame."""
+        if self._newest is not None and self._node.context.ok() and self.has_late_subscriber:
+            self._publish_due(self._newest, [row for row in self._publishers if row[0].qos is LATCHED_QOS])
 
-    def _publish(self, located: Located, result: FrameResult, slam: Slam) -> None:
-        motion = self._motion.observe(located, result)
-        self._moment = Moment(located, result.T_world_cam, motion, slam, self._path, self._options, self._factory)
-        self._path.append(self._moment.pose)
-        self._geometry.publish(located)
-        self._publish_due(self._moment, self._publishers)
+    def _publish_pose(self, located: Located, T_world_cam: Matrix, result: FrameResult, slam: Slam) -> None:
+        context = PublishContext(
+            located=located,
+            T_world_cam=T_world_cam,
+            motion=self._motion.observe(located, result),
+            slam=slam,
+            path=self._path,
+            options=self._options,
+            factory=self._factory,
+        )
+        self._newest = context
+        self._path.append(context.pose)
+        self._frames.publish(located)
+        self._publish_due(context, self._publishers)
         self.num_poses += 1
 
-    def _publish_due(self, moment: Moment, rows: Sequence[tuple[Output, Publisher]]) -> None:
-        now_s = time.monotonic()  # one for all: renders of one rate are of one frame
+    def _publish_due(self, context: PublishContext, rows: Sequence[tuple[Output, Publisher]]) -> None:
+        now_s = time.monotonic()  # the same for all, so that renders of equal rate show the same frame
         for output, publisher in rows:
             if self._is_due(output, publisher, now_s):
-                rate_hz = output.rate(self._options)
+                rate_hz = output.rate_hz(self._options)
                 self._due_s[output.topic] = now_s + (1 / rate_hz if rate_hz else 0.0)
-                self._said_ns[output.topic] = moment.stamp_ns
-                publisher.publish(output.message(moment))
+                self._published_ns[output.topic] = context.stamp_ns
+                publisher.publish(output.message(context))
 
     def _create(self, type_name: str, topic: str, qos: QoSProfile) -> Publisher:
         return self._node.create_publisher(message_class(type_name), f'~/{topic}', qos)

@@ -1,7 +1,7 @@
 """The node's ROS parameters: its own, and the whole SLAM configuration below ``slam.``.
 
-Both are tables of ``Setting``: names, help, units and bounds become ROS descriptors. What the user gives is
-checked against the same tables, so that the command line and ROS complain in the same words.
+Both are tables of ``Setting``: names, help, units and bounds become ROS descriptors. Values from the user are checked
+against the same tables, so the command line and ROS report the same errors.
 """
 
 from __future__ import annotations
@@ -11,12 +11,16 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
-from splatam_core.config import Setting, SlamConfig, Value, flat_values, load_config, settings
+from msg_adapters.synchronizer import Mode
+from splatam_core.config import SlamConfig, flat_values, load_config, settings
 from splatam_core.errors import ConfigError
+from splatam_core.settings import Setting, Value
+from splatam_ros.frames.options import FrameOptions
 
 SLAM = 'slam.'
 ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
@@ -27,75 +31,96 @@ def _setting(
     name: str, default: Value, help: str, unit: str = '', minimum: float | None = None, maximum: float | None = None,
     choices: tuple[str, ...] = (),
 ) -> Setting:  # fmt: skip
-    return Setting(name, type(default), default, help, unit, minimum, maximum, choices)
+    return Setting(
+        name=name, type=type(default), default=default, help=help, unit=unit, minimum=minimum, maximum=maximum,
+        choices=choices,
+    )  # fmt: skip
 
 
 NODE_SETTINGS: tuple[Setting, ...] = (
-    _setting('preset', 'quick', 'SLAM preset: the name of a shipped one, or a .yaml file.'),
-    _setting('save_path', '', 'New or empty folder for trajectory, map and metrics; none = nothing is saved.'),
-    _setting('save_root', '', 'save_path may change at run time to a folder below this; none = not at all.'),
-    _setting('overwrite', False, 'Replace the run that is in save_path, if nothing else is there.'),
-    _setting('save_on_shutdown', True, 'Save map and metrics at the end; the trajectory is written as it goes anyway.'),
+    _setting('preset', 'quick', 'SLAM preset: name of a shipped preset, or path of a .yaml file.'),
+    _setting('save_path', '', 'New or empty folder for trajectory, map and metrics; empty = save nothing.'),
+    _setting('save_root', '', 'At run time save_path can change to a folder below this one; empty = it cannot change.'),
+    _setting('overwrite', False, 'Replace an earlier run in save_path, if the folder holds nothing else.'),
+    _setting('save_on_shutdown', True, 'Save map and metrics at shutdown. The trajectory is written frame by frame anyway.'),
     _setting(
-        'finish_limit', 3.0, 'Longest time for mapping.final_passes before saving, when asked to stop: launch kills 10 s after '
-        'its Ctrl-C. A node that ends by itself (exit_on_publisher_end) takes as long as they need.', 's', 0.1
+        'finish_limit', 3.0, 'Longest time for mapping.fused.final_passes when the node is asked to stop. ros2 launch kills a '
+        'process 10 s after Ctrl-C; increase only if nothing kills the node. A node that ends by itself '
+        '(exit_on_publisher_end) has no limit.', 's', 0.1,
     ),
-    _setting('load_path', '', 'Map for ~/load_map, a .ply file or the folder of a run; loaded at the start, too.'),
-    _setting('load_pose', '', 'Where the camera is in a loaded map, x y z qx qy qz qw; none = where it began.', 'm'),
-    _setting('width', 0, 'Resize frames to this width; 0 = as they come.', 'px', 0, 16384),
-    _setting('map_frame', 'map', 'Frame of poses and map.'),
-    _setting('odom_frame', 'odom', 'Frame between map and base; empty = base is a child of map.'),
-    _setting('base_frame', '', 'Frame of the robot that the camera is fixed to; empty = the camera is all there is.'),
-    _setting('camera_frame', '', "Optical frame of the camera; empty = as the images' headers say."),
+    _setting('load_path', '', 'Map to load at start and on ~/load_map: a .ply file, or the folder of a run.'),
+    _setting('load_pose', '', 'Pose of the camera in the loaded map: x y z qx qy qz qw; empty = where the map began.', 'm'),
+    _setting('width', 0, 'Resize frames to this width. Decrease for speed. 0 = keep the size.', 'px', 0, 16384),
+    _setting('map_frame', 'map', 'Coordinate frame of poses and map.'),
+    _setting('odom_frame', 'odom', 'Coordinate frame between map and base; empty = base is a child of map.'),
+    _setting('base_frame', '', 'Coordinate frame of the robot that carries the camera; empty = locate only the camera.'),
+    _setting('camera_frame', '', "Optical frame of the camera; empty = use the images' frame id."),
     _setting('camera_in_base', '', 'Pose of the camera in base_frame: x y z qx qy qz qw, or x y z roll pitch yaw; '
-             'empty = from /tf_static.', 'm, rad'),
-    _setting('world_up', 'optical', "Axes of map_frame: the first camera's (z forward, y down), or upright (z up).",
+             'empty = look it up on /tf_static.', 'm, rad'),
+    _setting('world_up', 'optical', 'Axes of map_frame: optical = those of the first camera (z forward, y down); '
+             'z_up = upright (x forward, z up).',
              choices=('optical', 'z_up')),
-    _setting('publish_tf', True, 'Publish transforms.'),
-    _setting('odom.source', 'none', 'Where to start tracking from: constant velocity, the topic odom, or '
-             'odom_frame to base_frame on TF; with the latter two map to odom_frame is published as their correction.',
+    _setting('publish_tf', True, 'Publish transforms on /tf and /tf_static.'),
+    _setting('odom.source', 'none', 'Motion from which tracking starts: none = constant velocity, topic = the topic odom, '
+             'tf = odom_frame to base_frame on TF. With topic or tf the node publishes map to odom_frame as the correction.',
              choices=('none', 'topic', 'tf')),
-    _setting('odom.max_wait', 0.1, 'Wait this long for odometry that is newer than the frame.', 's', 0.0, 10.0),
-    _setting('stddev.position', 0.02, 'Of the pose that ~/odometry states, where all of a frame agrees with the map.',
-             'm', 1e-6, 100.0),
-    _setting('stddev.orientation', 0.01, 'Likewise.', 'rad', 1e-6, 10.0),
-    _setting('rgb_transport', 'raw', 'What rgb/image carries; compressed: rgb/image/compressed.',
+    _setting('odom.max_wait', 0.1, 'Longest wait for odometry that is newer than the frame. Increase when odometry arrives '
+             'later than the images.', 's', 0.0, 10.0),
+    _setting('stddev.position', 0.02, 'Standard deviation of the position on ~/odometry when the whole frame agrees with the '
+             'map. Increase when a filter trusts the poses too much.', 'm', 1e-6, 100.0),
+    _setting('stddev.orientation', 0.01, 'Standard deviation of the orientation, likewise.', 'rad', 1e-6, 10.0),
+    _setting('rgb_transport', 'raw', 'Transport of rgb/image; compressed = subscribe to rgb/image/compressed.',
              choices=('raw', 'compressed')),
-    _setting('depth_transport', 'raw', 'What depth/image carries; compressedDepth: depth/image/compressedDepth.',
+    _setting('depth_transport', 'raw', 'Transport of depth/image; compressedDepth = subscribe to '
+             'depth/image/compressedDepth.',
              choices=('raw', 'compressedDepth')),
-    _setting('depth_scale', 0.001, 'A count of 16-bit depth; drivers send millimetres, some recordings others.', 'm',
-             1e-6, 1.0),
-    _setting('undistort', True, 'Undistort images by K and D; off = they are rectified (image_rect) to camera P.'),
-    _setting('sync.mode', 'approximate', 'Pair colour and depth of equal, or of nearby stamps.',
+    _setting('depth_scale', 0.001, 'Length of one step of 16-bit depth images. Drivers send millimetres (0.001), some '
+             'recordings other steps (TUM PNG files: 0.0002).', 'm', 1e-6, 1.0),
+    _setting('undistort', True, 'Undistort images by K and D of CameraInfo; false = the images are rectified (image_rect), '
+             'and P is their camera.'),
+    _setting('sync.mode', 'approximate', 'How colour and depth are paired: by equal stamps, or by the nearest stamps.',
              choices=('exact', 'approximate')),
-    _setting('sync.max_interval', 0.02, 'Stamps of a pair differ by at most this.', 's', 0.0, 10.0),
-    _setting('sync.queue_size', 30, 'Images of each kind that wait for their partner.', '', 1, 1000),
-    _setting('on_time_jump', 'reset', 'When stamps jump back (a recording loops): new map, or go on in this one.',
+    _setting('sync.max_interval', 0.02, 'Largest difference between the stamps of a pair (approximate only). Increase when '
+             'nothing pairs; decrease when a moving camera smears the map.', 's', 0.0, 10.0),
+    _setting('sync.queue_size', 30, 'Number of colour and of depth images that can wait for a partner. Increase when one '
+             'stream arrives much later than the other.', '', 1, 1000),
+    _setting('on_time_jump', 'reset', 'What to do when stamps jump back, e.g. when a recording loops: reset = start a new map, '
+             'continue = keep the map and continue from the last pose.',
              choices=('reset', 'continue')),
-    _setting('time_jump_threshold', 1.0, 'Stamps that fall back by more have jumped; by less, they are late.', 's',
-             0.0, 3600.0),
-    _setting('on_camera_change', 'reset', 'When CameraInfo changes: new map, or refuse frames of another camera.',
+    _setting('time_jump_threshold', 1.0, 'Stamps that fall back by more than this are a time jump; by less, the image is late '
+             'and dropped.', 's', 0.0, 3600.0),
+    _setting('on_camera_change', 'reset', 'What to do when CameraInfo changes: reset = start a new map, refuse = drop frames of '
+             'the other camera.',
              choices=('reset', 'refuse')),
-    _setting('lost_reset_after', 0.0, 'Start a new map when lost for this long; 0 = never.', 's', 0.0, 3600.0),
-    _setting('max_rate_hz', 0.0, 'Frames to SLAM in a second of their own time at most; 0 = all.', 'Hz', 0.0, 1000.0),
-    _setting('input_reliability', 'auto', 'QoS of the inputs; auto: reliable, unless a publisher is best effort.',
+    _setting('lost_reset_after', 0.0, 'Start a new map after the camera was lost for this long; 0 = never.', 's', 0.0, 3600.0),
+    _setting('max_rate_hz', 0.0, 'Largest number of frames per second, by their stamps, that are passed to SLAM; 0 = all.',
+             'Hz', 0.0, 1000.0),
+    _setting('input_reliability', 'auto', 'QoS reliability of the inputs; auto = reliable, or best effort if the publisher '
+             'offers only that.',
              choices=('auto', 'reliable', 'best_effort')),
-    _setting('queue_policy', 'latest', 'When frames come faster than SLAM: latest drops old ones, all keeps every one.',
+    _setting('queue_policy', 'latest', 'What to do when frames come faster than SLAM: latest = drop the oldest (live camera), '
+             'all = keep every frame and slow the input down (recording).',
              choices=('latest', 'all')),
-    _setting('queue_size', 2, 'Frames that wait for SLAM.', '', 1, 1000),
-    _setting('max_cloud_points', 200_000, 'Points of a published cloud at most.', '', 1, 50_000_000),
-    _setting('max_path_poses', 2000, 'Poses of a published path at most; evenly thinned out.', '', 2, 1_000_000),
-    _setting('publish_rate.path', 1.0, 'Paths a second at most; 0 = one a frame.', 'Hz', 0.0, 1000.0),
-    _setting('publish_rate.render', 0.0, 'Renders a second at most; 0 = one a frame.', 'Hz', 0.0, 1000.0),
-    _setting('publish_rate.cloud', 1.0, 'Clouds a second at most; 0 = one a frame.', 'Hz', 0.0, 1000.0),
-    _setting('no_data_timeout', 5.0, 'Say why when no frame has come for this long; 0 = never.', 's', 0.0, 3600.0),
-    _setting('exit_on_publisher_end', False, 'Save and exit once the image publishers have left and all is processed.'),
+    _setting('queue_size', 2, 'Number of frames that can wait for SLAM. Decrease for less delay, increase when the frame rate '
+             'is uneven.', '', 1, 1000),
+    _setting('max_cloud_points', 200_000, 'Largest number of points in a published cloud. Decrease when the network is slow.',
+             '', 1, 50_000_000),
+    _setting('max_path_poses', 2000, 'Largest number of poses in a published path; a longer path is thinned out evenly.', '',
+             2, 1_000_000),
+    _setting('publish_rate.path', 1.0, 'Largest rate of ~/path; 0 = with every pose.', 'Hz', 0.0, 1000.0),
+    _setting('publish_rate.render', 0.0, 'Largest rate of ~/render/*; 0 = with every pose. Decrease to save time.', 'Hz', 0.0,
+             1000.0),
+    _setting('publish_rate.cloud', 1.0, 'Largest rate of ~/map/points; 0 = with every pose.', 'Hz', 0.0, 1000.0),
+    _setting('no_data_timeout', 5.0, 'Warn, with the reason, when no frame was received for this long; 0 = never.', 's', 0.0,
+             3600.0),
+    _setting('exit_on_publisher_end', False, 'Save and exit when the publishers of the images are gone and every frame is '
+             'processed.'),
 )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class NodeOptions:
-    """The node's own parameters; ``NODE_SETTINGS`` says what each is. Dots are underscores here."""
+    """The node's own parameters, described by ``NODE_SETTINGS``. A dot in a name is an underscore here."""
 
     preset: str
     save_path: str
@@ -121,7 +146,7 @@ class NodeOptions:
     depth_transport: str
     depth_scale: float
     undistort: bool
-    sync_mode: str
+    sync_mode: Mode
     sync_max_interval: float
     sync_queue_size: int
     on_time_jump: str
@@ -142,63 +167,93 @@ class NodeOptions:
 
     @property
     def folder(self) -> Path | None:
-        """Where to save; None = nowhere."""
+        """Folder to save in; None = save nothing."""
         return Path(self.save_path).expanduser() if self.save_path else None
+
+    @property
+    def keeps_all(self) -> bool:
+        """True if every frame is processed, False if old frames are dropped when SLAM is slower than the camera."""
+        return self.queue_policy == 'all'
+
+    @property
+    def frames(self) -> FrameOptions:
+        """Options of the coordinate frames."""
+        return FrameOptions(
+            map_frame=self.map_frame,
+            odom_frame=self.odom_frame,
+            base_frame=self.base_frame,
+            camera_frame=self.camera_frame,
+            camera_in_base=self.camera_in_base,
+            world_up=self.world_up,
+            publish_tf=self.publish_tf,
+            odom_source=self.odom_source,
+            odom_max_wait_s=self.odom_max_wait,
+        )
 
 
 def field_name(name: str) -> str:
-    """The field of ``NodeOptions`` that a parameter is in."""
+    """Returns the field of ``NodeOptions`` that holds a parameter."""
     return name.replace('.', '_')
 
 
-# Everything else is read when the node starts.
+# Parameters that can change while the node runs. All others are read only when it starts.
 CHANGEABLE = frozenset({
     'save_path', 'save_on_shutdown', 'finish_limit', 'load_path', 'load_pose', 'on_time_jump', 'on_camera_change',
     'lost_reset_after', 'max_rate_hz', 'max_cloud_points', 'publish_rate.path', 'publish_rate.render', 'publish_rate.cloud',
     'no_data_timeout', 'exit_on_publisher_end',
 })  # fmt: skip
 FIXED = {
-    'preset': 'it is what all other settings start from; change those below slam.',
-    'save_root': 'it is the limit of what may be changed',
-    'width': 'frames of another size are those of another camera',
-    'max_path_poses': 'the path so far is thinned out by it',
-    'slam.seed': 'it is where the random choices of this map started',
-    'slam.width': "it is of 'splatam run'; the node's own is width",
-    'slam.threads': 'the threads are running',
-    'slam.device': 'the map is there',
-    'slam.rasterizer': 'it is made when the node starts',
-    'slam.tracking.motion_model': 'it is made when the map starts',
-    'slam.mapping.anisotropic': 'the map is made of the one kind or of the other',
-    'slam.mapping.mode': 'the threads are running',
-    'slam.mapping.hold_out': 'frames are told apart by it when the run is scored',
+    'preset': 'all other settings start from it; change those below slam.',
+    'save_root': 'it limits what may be changed',
+    'width': 'frames of another size belong to another camera',
+    'max_path_poses': 'the existing path is thinned out by it',
+    'slam.seed': 'it seeds the random numbers of this map when the map starts',
+    'slam.width': "it is for 'splatam run'; the node's parameter is width",
+    'slam.threads': 'the threads are already running',
+    'slam.device': 'the map is already on a device',
+    'slam.rasterizer': 'the rasterizer is created when the node starts',
+    'slam.tracking.motion_model': 'the motion model is created when the map starts',
+    'slam.mapping.anisotropic': 'a map has Gaussians of one kind only',
+    'slam.mapping.hold_out': 'the evaluation uses it to find the frames that were held out',
     'slam.mapping.scene_radius_ratio': 'it is read when the map starts',
 }
 
 
 def why_fixed(name: str) -> str:
-    """Why a parameter cannot change while the node runs; empty if it can."""
+    """Returns why a parameter cannot change while the node runs; empty if it can."""
     if name in CHANGEABLE or (name.startswith(SLAM) and name not in FIXED):
         return ''
     return FIXED.get(name, 'it is read when the node starts')
 
 
 def declare(node: Node) -> tuple[NodeOptions, SlamConfig]:
-    """Declare every parameter of a node that was made with ``automatically_declare_parameters_from_overrides``.
+    """Declare every parameter of a node that was created with ``automatically_declare_parameters_from_overrides``.
+
+    Returns:
+        The node's own parameters, and the SLAM configuration.
 
     Raises:
-        ConfigError: an unknown ``slam.`` parameter, or a value that is not allowed.
+        ConfigError: a ``slam.`` parameter is unknown, or a value is not allowed.
     """
-    given = {name: parameter.value for name, parameter in node.get_parameters_by_prefix('').items()}
+    found: Mapping[str, Any] = node.get_parameters_by_prefix('')
+    given = {name: parameter.value for name, parameter in found.items()}
     own = _checked(given)
     _check_names(node, given)
     slam = {name.removeprefix(SLAM): value for name, value in given.items() if name.startswith(SLAM)}
-    config = _load(own['preset'], slam)
+    config = _load(str(own['preset']), slam)
     for setting in NODE_SETTINGS:
         _declare(node, setting.name, setting, own[setting.name])
     values = flat_values(config)
     for setting in settings():
         _declare(node, SLAM + setting.name, setting, values[setting.name])
-    return NodeOptions(**{field_name(name): value for name, value in own.items()}), config
+    return node_options(own), config
+
+
+def node_options(values: Mapping[str, Value]) -> NodeOptions:
+    """Returns options with the given values by parameter name; all others have their defaults. Values are not checked."""
+    named = {setting.name: setting.default for setting in NODE_SETTINGS} | dict(values)
+    fields: dict[str, Any] = {field_name(name): value for name, value in named.items()}
+    return NodeOptions(**fields)
 
 
 def _checked(given: Mapping[str, object]) -> dict[str, Value]:
@@ -213,7 +268,7 @@ def _load(preset: str, slam: Mapping[str, object]) -> SlamConfig:
 
 
 def _check_names(node: Node, given: Mapping[str, object]) -> None:
-    """Warn of parameters that are nobody's; a file for several nodes may name them rightly."""
+    """Warn about unknown parameters. They are no error, since a file for several nodes may contain those of others."""
     known = [setting.name for setting in NODE_SETTINGS]
     for name in given:
         if name not in known and not name.startswith((SLAM, *ROS_OWN)):
@@ -223,7 +278,7 @@ def _check_names(node: Node, given: Mapping[str, object]) -> None:
 
 
 def _declare(node: Node, name: str, setting: Setting, value: Value) -> None:
-    """Declare one parameter, anew if the user gave it: only now its type and bounds are known to ROS."""
+    """Declare one parameter. One that the user gave is declared again, so that ROS knows its type and bounds."""
     if node.has_parameter(name):
         node.undeclare_parameter(name)
     node.declare_parameter(name, value, _descriptor(setting, why_fixed(name)), ignore_override=True)
@@ -231,19 +286,18 @@ def _declare(node: Node, name: str, setting: Setting, value: Value) -> None:
 
 def _descriptor(setting: Setting, why_fixed: str) -> ParameterDescriptor:
     unit = f' [{setting.unit}]' if setting.unit else ''
-    # Not read_only: ROS would refuse a change before we can say why.
+    # Not read_only: ROS would refuse a change before the node can give the reason.
     descriptor = ParameterDescriptor(description=setting.help + unit)
     constraints = ['one of ' + ', '.join(setting.choices)] if setting.choices else []
     constraints += [f'cannot change at run time: {why_fixed}'] if why_fixed else []
     descriptor.additional_constraints = '; '.join(constraints)
     if setting.minimum is None and setting.maximum is None:
         return descriptor
+    limit = MAX_INTEGER if setting.type is int else sys.float_info.max
+    low = -limit if setting.minimum is None else setting.minimum
+    high = limit if setting.maximum is None else setting.maximum
     if setting.type is int:
-        low = -MAX_INTEGER if setting.minimum is None else int(setting.minimum)
-        high = MAX_INTEGER if setting.maximum is None else int(setting.maximum)
-        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     else:
-        low = -sys.float_info.max if setting.minimum is None else setting.minimum
-        high = sys.float_info.max if setting.maximum is None else setting.maximum
         descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
     return descriptor

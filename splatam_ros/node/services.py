@@ -1,4 +1,4 @@
-"""The node's services, all ``std_srvs/Trigger``. What touches the map runs on the worker's thread; nobody waits."""
+"""The node's services, all of type ``std_srvs/Trigger``. Those that touch the map run on the worker's thread."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from std_srvs.srv import Trigger
 from splatam_core.errors import SplatamError
 from splatam_core.slam import Slam
 from splatam_core.worker import SlamWorker
-from splatam_ros.node.gate import Gate
-from splatam_ros.node.map_lifecycle import Session
+from splatam_ros.node.gate import FrameGate
+from splatam_ros.node.map_lifecycle import MapLifecycle
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class Service:
     """A service of the node.
 
     Attributes:
-        name: below the node's name.
-        help: what it does, for the documentation.
+        name: name below the node's name.
+        help: one line for the documentation.
     """
 
     name: str
@@ -32,67 +32,79 @@ class Service:
 
 
 SERVICES = (
-    Service('reset', 'forget map and poses; the next frame starts a new map. The run so far is kept in `previous/`'),
-    Service('pause', 'let frames go until `~/resume`; the map stays as it is'),
-    Service('resume', 'take frames again, from the last pose'),
-    Service('save_map', 'save map, trajectory and metrics in `save_path`, each file in one step'),
-    Service('load_map', 'go on in the map at `load_path` from `load_pose`; `slam.mapping.enabled` off: only localise'),
+    Service('reset', 'drop map and poses; the next frame starts a new map. The run so far is kept in `previous/`'),
+    Service('pause', 'drop frames until `~/resume`; the map does not change'),
+    Service('resume', 'process frames again, starting from the last pose'),
+    Service('save_map', 'save map, trajectory and metrics in `save_path`; each file is replaced atomically'),
+    Service('load_map', 'continue in the map at `load_path` from `load_pose`; with `slam.mapping.enabled` off only localize'),
 )
 
 
-class Done(Protocol):
+class FinishedCall(Protocol):
     """The part of ``concurrent.futures.Future`` that is used here."""
 
     def cancelled(self) -> bool:
-        """Whether it will never run."""
+        """Returns True if the call will never run."""
 
     def exception(self) -> BaseException | None:
-        """What went wrong."""
+        """Returns the exception of the call, if it failed."""
 
     def result(self) -> str:
-        """What it said."""
+        """Returns the result of the call."""
 
 
 class Services:
-    """Serves ``SERVICES``. A failure is an answer with ``success`` false and the reason; it never ends the node."""
+    """Serves ``SERVICES``. A failure is answered with ``success`` false and the reason; it never ends the node."""
 
-    def __init__(self, node: Node, worker: SlamWorker, session: Session, gate: Gate) -> None:
+    def __init__(self, node: Node, worker: SlamWorker, lifecycle: MapLifecycle, gate: FrameGate) -> None:
         self._node = node
         self._worker = worker
-        self._session = session
+        self._lifecycle = lifecycle
         self._gate = gate
         actions: dict[str, Callable[[], Awaitable[Trigger.Response]]] = {
-            'reset': lambda: self._on_worker(lambda slam: session.reset(slam, 'asked for by ~/reset')),
+            'reset': self._reset,
             'pause': self._pause,
             'resume': self._resume,
-            'save_map': lambda: self._on_worker(self._save),
-            'load_map': lambda: self._on_worker(session.load),
+            'save_map': self._save_map,
+            'load_map': self._load_map,
         }
         for service in SERVICES:
             node.create_service(Trigger, f'~/{service.name}', _handler(actions[service.name]))
 
+    async def _reset(self) -> Trigger.Response:
+        return await self._on_worker(self._reset_slam)
+
     async def _pause(self) -> Trigger.Response:
         was_paused, self._gate.is_paused = self._gate.is_paused, True
-        return _succeeded('was paused already' if was_paused else 'paused: frames are let go until ~/resume')
+        return _succeeded('was paused already' if was_paused else 'paused: frames are dropped until ~/resume')
 
     async def _resume(self) -> Trigger.Response:
         if not self._gate.is_paused:
             return _succeeded('was not paused')
-        response = await self._on_worker(_rest)  # before the first new frame, which is admitted only then
+        response = await self._on_worker(_rest)  # before the first new frame, which the gate admits only afterwards
         self._gate.is_paused = False
         return response
 
-    def _save(self, slam: Slam) -> str:
-        metrics = self._session.save(slam)
-        return f'saved {metrics.num_gaussians} Gaussians and {metrics.frames} frames in {self._session.folder}'
+    async def _save_map(self) -> Trigger.Response:
+        return await self._on_worker(self._lifecycle.save)
+
+    async def _load_map(self) -> Trigger.Response:
+        return await self._on_worker(self._lifecycle.load)
+
+    def _reset_slam(self, slam: Slam) -> str:
+        return self._lifecycle.reset(slam, 'requested by ~/reset')
 
     async def _on_worker(self, action: Callable[[Slam], str]) -> Trigger.Response:
-        """Run an action between two frames; what it says is the answer."""
+        """Run an action between two frames; it returns the message of the answer."""
         answer = Future()
-        self._worker.call(action).add_done_callback(lambda done: answer.set_result(self._response(done)))
+
+        def respond(done: FinishedCall) -> None:
+            answer.set_result(self._response(done))
+
+        self._worker.call(action).add_done_callback(respond)
         return await answer
 
-    def _response(self, done: Done) -> Trigger.Response:
+    def _response(self, done: FinishedCall) -> Trigger.Response:
         if done.cancelled():
             return _failed('SLAM has stopped')
         error = done.exception()

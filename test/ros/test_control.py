@@ -18,7 +18,7 @@ from splatam_core.maps.ply import read_ply, write_ply
 from splatam_core.runs.record import read_run
 from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame
-from splatam_ros.node.gate import Gate
+from splatam_ros.node.gate import FrameGate
 
 SECOND = 10**9
 # Where a camera that does not move may be found, at 64 pixels width and a handful of steps: a pixel is 4 cm at 2.5 m.
@@ -40,7 +40,7 @@ def test_pause_resume_reset_and_save(graph: Graph, frames: SyntheticSequence) ->
     saved = read_ply(out / 'map.ply')
     assert len(saved.means) > 500 and len(read_run(out).trajectory) == 3
 
-    assert 'let go' in control.succeed('pause') and 'already' in control.succeed('pause')
+    assert 'dropped' in control.succeed('pause') and 'already' in control.succeed('pause')
     assert [live.show(still(frames, number)) for number in (3, 4)] == [None, None]  # answered, but not looked at
     control.succeed('save_map')
     assert len(read_run(out).frames) == 3 and len(read_ply(out / 'map.ply').means) == len(saved.means)
@@ -53,7 +53,7 @@ def test_pause_resume_reset_and_save(graph: Graph, frames: SyntheticSequence) ->
     assert pose is not None and not position(pose).any()  # a new world begins where the camera is
     assert [len(read_run(path).trajectory) for path in (out, out / 'previous')] == [1, 4]
     assert (out / 'previous' / 'map.ply').is_file()
-    assert live.node.says('map reset: asked for by ~/reset')
+    assert live.node.says('map reset: requested by ~/reset')
 
 
 def test_saving_elsewhere_at_run_time(graph: Graph, frames: SyntheticSequence) -> None:
@@ -149,14 +149,14 @@ def test_the_frame_rate_is_limited_by_stamps_and_can_be_changed(graph: Graph, fr
 
 @pytest.mark.parametrize('jitter_ns', [0, 2_000_000, -2_000_000])
 def test_a_rate_is_kept_on_average_whatever_the_jitter(jitter_ns: int) -> None:
-    gate = Gate(max_rate_hz=10.0)
+    gate = FrameGate(max_rate_hz=10.0)
     stamps_ns = [number * 33_333_333 + (number % 2) * jitter_ns for number in range(300)]  # 10 s at 30 Hz
     admitted = [stamp_ns for stamp_ns in stamps_ns if gate.admits(0, stamp_ns)]
     assert 99 <= len(admitted) <= 101
 
 
 def test_a_gate_follows_time_back() -> None:
-    gate = Gate(max_rate_hz=1.0)
+    gate = FrameGate(max_rate_hz=1.0)
     assert gate.admits(0, 100 * SECOND) and not gate.admits(0, 100 * SECOND + 1)
     assert gate.admits(1, 5 * SECOND) and not gate.admits(1, 5 * SECOND + 1)
     assert gate.admits(1, 500 * SECOND) and not gate.admits(1, 500 * SECOND + 1)  # no backlog of admissions after a gap

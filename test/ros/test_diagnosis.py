@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from builtin_interfaces.msg import Time
@@ -18,11 +20,11 @@ from msg_adapters import camera_info
 from msg_adapters.camera_info import CameraParameters
 from msg_adapters.factory import RclpyMessages
 from splatam_core.datasets.synthetic import SyntheticSequence
-from splatam_ros.node.frame_assembler import Intake
-from splatam_ros.node.gate import Gate
+from splatam_ros.node.frame_assembler import FrameAssembler
+from splatam_ros.node.gate import FrameGate
 from splatam_ros.node.input_watchdog import why_no_frames
-from splatam_ros.node.parameters import NODE_SETTINGS, NodeOptions
-from splatam_ros.subscription import Input
+from splatam_ros.node.parameters import node_options
+from splatam_ros.subscription import MonitoredSubscription
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 STREAMS = ((CameraInfo, '/rgb/camera_info'), (Image, '/rgb/image'), (Image, '/depth/image'))
@@ -31,24 +33,23 @@ STREAMS = ((CameraInfo, '/rgb/camera_info'), (Image, '/rgb/image'), (Image, '/de
 class Receiver:
     """The node's inputs without the node."""
 
-    def __init__(self, graph: Graph, **options: object) -> None:
-        defaults = {setting.name.replace('.', '_'): setting.default for setting in NODE_SETTINGS}
-        self.options = NodeOptions(**{**defaults, **options})
+    def __init__(self, graph: Graph, **options: Any) -> None:
+        self.options = node_options(options)
         self.node = graph.node
-        self.skipped: list[int] = []
+        self.rejected: list[int] = []
         warnings = ThrottledWarnings(graph.node.get_logger())
-        self.intake = Intake(self.options, warnings, Gate(self.options.max_rate_hz), self.skipped.append)
+        self.assembler = FrameAssembler(self.options, warnings, FrameGate(self.options.max_rate_hz), self.rejected.append)
         self.inputs = [
-            Input(graph.node, message_class, topic, add, reliability=self.options.input_reliability, keep_all=False)
+            MonitoredSubscription(graph.node, message_class, topic, add, reliability=self.options.input_reliability, keep_all=False)
             for message_class, topic, add in (
-                (CameraInfo, 'rgb/camera_info', self.intake.info),
-                (Image, 'rgb/image', self.intake.color),
-                (Image, 'depth/image', self.intake.depth),
+                (CameraInfo, 'rgb/camera_info', self.assembler.add_info),
+                (Image, 'rgb/image', self.assembler.add_color),
+                (Image, 'depth/image', self.assembler.add_depth),
             )
         ]
 
     def why(self) -> str:
-        return why_no_frames(self.node, self.inputs, self.intake.statistics, self.options)
+        return why_no_frames(self.node, self.inputs, self.assembler.statistics, self.options)
 
 
 def image(stamp_ms: int) -> Image:
@@ -63,12 +64,12 @@ def test_each_cause_is_told_apart(graph: Graph) -> None:
     color = graph.publisher(Image, '/rgb/image')
     info = graph.publisher(CameraInfo, '/rgb/camera_info')
     graph.spin_until(lambda: 'no publisher on /depth/image;' in receiver.why(), explain=receiver.why)
-    assert 'of that type there is /rgb/image; remap: -r depth/image:=/rgb/image' in receiver.why()
+    assert 'topics of that type: /rgb/image; remap: -r depth/image:=/rgb/image' in receiver.why()
     depth = graph.publisher(Image, '/depth/image')
-    graph.spin_until(lambda: 'are published, but no message has come' in receiver.why(), explain=receiver.why)
+    graph.spin_until(lambda: 'have publishers, but no message was received' in receiver.why(), explain=receiver.why)
     color.publish(image(100))
     depth.publish(image(350))
-    graph.spin_until(lambda: '/rgb/camera_info is published, but no message' in receiver.why(), explain=receiver.why)
+    graph.spin_until(lambda: '/rgb/camera_info has a publisher, but no message' in receiver.why(), explain=receiver.why)
     info.publish(CameraInfo())
     graph.spin_until(lambda: 'none that can be used' in receiver.why(), explain=receiver.why)
     camera = CameraParameters(64, 48, 50.0, 50.0, 31.5, 23.5)
@@ -77,30 +78,35 @@ def test_each_cause_is_told_apart(graph: Graph) -> None:
     assert '0.250 s apart' in receiver.why() and 'sync.max_interval is 0.02 s' in receiver.why()
     receiver.options = replace(receiver.options, no_data_timeout=0.2)
     graph.spin_for(0.3)
-    color.publish(image(400))
-    graph.spin_until(lambda: 'nothing has come on /depth/image for' in receiver.why(), explain=receiver.why)
+    stamps_ms = itertools.count(400)
+
+    def only_depth_has_stopped() -> bool:
+        color.publish(image(next(stamps_ms)))
+        return 'nothing was received on /depth/image for' in receiver.why()
+
+    graph.spin_until(only_depth_has_stopped, explain=receiver.why)
 
 
 def test_another_type_on_the_topic(graph: Graph) -> None:
     for message_class, topic in ((CameraInfo, '/rgb/camera_info'), (CompressedImage, '/rgb/image'), STREAMS[2]):
         graph.publisher(message_class, topic)
     node = graph.run_node(preset='quick', no_data_timeout=1.0)
-    carries = 'no frame for 1 s: /rgb/image carries sensor_msgs/msg/CompressedImage, expected sensor_msgs/msg/Image'
+    carries = 'no frame for 1 s: /rgb/image has type sensor_msgs/msg/CompressedImage, expected sensor_msgs/msg/Image'
     node.wait_says(carries, 'remap, or set rgb_transport')
 
 
 def test_sim_time_without_a_clock(graph: Graph) -> None:
     receiver = Receiver(graph)
     publishers = [graph.publisher(message_class, topic) for message_class, topic in STREAMS]
-    graph.spin_until(lambda: 'are published, but no message' in receiver.why(), explain=receiver.why)
+    graph.spin_until(lambda: 'have publishers, but no message' in receiver.why(), explain=receiver.why)
     graph.node.set_parameters([Parameter('use_sim_time', value=True)])
     assert receiver.why().startswith('use_sim_time is true and /clock has no publisher')
     clock = graph.publisher(Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
-    graph.spin_until(lambda: '/clock is published, but says nothing' in receiver.why(), explain=receiver.why)
+    graph.spin_until(lambda: '/clock has a publisher, but no message' in receiver.why(), explain=receiver.why)
 
     def tick() -> bool:
         clock.publish(Clock(clock=Time(sec=5)))
-        return 'are published, but no message' in receiver.why()
+        return 'have publishers, but no message' in receiver.why()
 
     graph.spin_until(tick, explain=receiver.why)
     assert publishers

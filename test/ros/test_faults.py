@@ -65,7 +65,7 @@ def test_a_publisher_that_is_killed_and_started_again(graph: Graph) -> None:
     graph.spin_until(lambda: len(poses) >= 3, explain=lambda: node.text + first.text)
     first.send(signal.SIGKILL)
     # The graph notices a process that vanished only after DDS's lease of some seconds; silence is noticed at once.
-    node.wait_says('no frame for 1 s: nothing has come on /rgb/image and /depth/image')
+    node.wait_says('no frame for 1 s: nothing was received on /rgb/image and /depth/image')
     before = len(poses)
     second = start_publisher(graph)
     graph.spin_until(lambda: len(poses) >= before + 3, explain=lambda: node.text + second.text)
@@ -105,10 +105,10 @@ def test_depth_that_stops_and_comes_back(graph: Graph, frames: SyntheticSequence
     def only_colour() -> bool:
         live.camera.send(still(frames, next(sent)), only=('info', 'rgb'))
         graph.spin_for(0.05)
-        return live.node.says('no frame for 1 s: nothing has come on /depth/image for', 'though published')
+        return live.node.says('no frame for 1 s: nothing was received on /depth/image for', 'though there is a publisher')
 
     live.wait(only_colour)
-    assert live.node.says('dropped: (colour) without depth', 'the newest depth is -')
+    assert live.node.says('dropped: colour without depth', 'the newest depth is -')
     assert live.show(still(frames, next(sent)))
 
 
@@ -117,8 +117,8 @@ def test_camera_info_that_is_late(graph: Graph, frames: SyntheticSequence) -> No
     for number in range(6):
         live.camera.send(still(frames, number), only=('rgb', 'depth'))
         graph.spin_for(0.2)  # in a burst, three of one stream could push each other out before the other stream comes
-    live.wait_says('no frame for 1 s: /rgb/camera_info is published, but no message has come')
-    live.wait_says('dropped: with depth, but no CameraInfo has come')
+    live.wait_says('no frame for 1 s: /rgb/camera_info has a publisher, but no message was received')
+    live.wait_says('dropped: paired, but no CameraInfo was received')
     graph.spin_for(9.0)  # with what has passed already, 10 s
     assert not live.done
     live.camera.send(still(frames, 6), only=('info',))  # as many as fit the queue have waited for it
@@ -141,7 +141,7 @@ def test_one_message_in_ten_is_lost(graph: Graph, frames: SyntheticSequence) -> 
     live.wait_done(expected[-1])
     assert 40 < len(expected) < 60  # some are lost indeed
     assert [stamps.to_ns(header.stamp) for header in live.done][1:] == expected
-    live.wait_says('dropped: (colour) without depth')
+    live.wait_says('dropped: colour without depth')
     live.wait(lambda: len(live.poses) > len(expected))
     assert [stamps.message_stamp_ns(pose) for pose in live.poses][1:] == expected
 
@@ -171,7 +171,7 @@ def test_corrupted_compressed_frames(graph: Graph, frames: SyntheticSequence) ->
         live.camera.publish(messages)
     pose = live.show(still(frames, 41))
     assert pose is not None and np.linalg.norm(position(pose)) < STILL_M
-    assert live.node.says('colour left out', 'truncated or damaged') and 'Traceback' not in live.node.text
+    assert live.node.says('colour skipped', 'truncated or damaged') and 'Traceback' not in live.node.text
     assert len(live.done) < 42  # damage was noticed
 
 

@@ -23,9 +23,9 @@ from splatam_core.geometry.camera import CameraCalibration
 from splatam_core.images.rectification import FrameFactory
 from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame
-from splatam_ros.node.frame_assembler import Intake
-from splatam_ros.node.gate import Gate
-from splatam_ros.node.parameters import NODE_SETTINGS, NodeOptions
+from splatam_ros.node.frame_assembler import FrameAssembler
+from splatam_ros.node.gate import FrameGate
+from splatam_ros.node.parameters import node_options
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 SECOND = 10**9
@@ -37,20 +37,20 @@ STILL_M = 0.04  # a pixel, at 64 pixels width and 2.5 m
 
 @dataclass
 class Bench:
-    """An intake, and what it says."""
+    """A frame assembler, and what it logs."""
 
-    intake: Intake
-    gate: Gate
-    skipped: list[int]
+    assembler: FrameAssembler
+    gate: FrameGate
+    rejected: list[int]
     said: Callable[[], str]
 
     def feed(
         self, stamp_ns: int, *, info: CameraInfo | None = None, rgb: Any = RGB, depth_m: Any = DEPTH,
         depth_delay_ns: int = 0, depth_frame: str = CAMERA_FRAME,
     ) -> list[RgbdFrame]:  # fmt: skip
-        frames = self.intake.info(info or camera_info.info_message(MAKE, PARAMETERS, stamp_ns))
-        frames += self.intake.color(images.color_message(MAKE, rgb, stamp_ns, CAMERA_FRAME))
-        return frames + self.intake.depth(images.depth_message(MAKE, depth_m, stamp_ns + depth_delay_ns, depth_frame))
+        frames = self.assembler.add_info(info or camera_info.info_message(MAKE, PARAMETERS, stamp_ns))
+        frames += self.assembler.add_color(images.color_message(MAKE, rgb, stamp_ns, CAMERA_FRAME))
+        return frames + self.assembler.add_depth(images.depth_message(MAKE, depth_m, stamp_ns + depth_delay_ns, depth_frame))
 
 
 @pytest.fixture
@@ -62,11 +62,11 @@ def make_bench(graph: Graph, capfd: pytest.CaptureFixture[str]) -> Callable[...,
         return text[0]
 
     def make(**options: Any) -> Bench:
-        defaults = {setting.name.replace('.', '_'): setting.default for setting in NODE_SETTINGS}
-        gate, skipped = Gate(options.get('max_rate_hz', 0.0)), []
+        gate = FrameGate(options.get('max_rate_hz', 0.0))
+        rejected: list[int] = []
         warnings = ThrottledWarnings(graph.node.get_logger())
-        intake = Intake(NodeOptions(**{**defaults, **options}), warnings, gate, skipped.append)
-        return Bench(intake, gate, skipped, said)
+        assembler = FrameAssembler(node_options(options), warnings, gate, rejected.append)
+        return Bench(assembler, gate, rejected, said)
 
     return make
 
@@ -133,7 +133,7 @@ def test_camera_info_of_zeros_changes_nothing(make_bench: Callable[..., Bench]) 
     assert (first.stamp_ns, second.stamp_ns) == (SECOND, 2 * SECOND)
     (frame,) = bench.feed(3 * SECOND, info=info(k=[0.0] * 9))
     assert frame.camera == first.camera
-    assert 'CameraInfo left out' in bench.said() and 'not calibrated' in bench.said()
+    assert 'CameraInfo skipped' in bench.said() and 'not calibrated' in bench.said()
 
 
 def test_depth_of_half_the_resolution_is_taken_other_shapes_are_refused(make_bench: Callable[..., Bench]) -> None:
@@ -141,7 +141,7 @@ def test_depth_of_half_the_resolution_is_taken_other_shapes_are_refused(make_ben
     (frame,) = bench.feed(SECOND, depth_m=DEPTH[::2, ::2])
     assert frame.depth_m.shape == (48, 64) and (frame.depth_m == 2.0).all()
     assert bench.feed(2 * SECOND, depth_m=DEPTH[:36]) == []
-    assert 'frame left out: depth image is 64x36' in bench.said() and 'aligned_depth_to_color' in bench.said()
+    assert 'frame skipped: depth image is 64x36' in bench.said() and 'aligned_depth_to_color' in bench.said()
 
 
 def test_colour_and_depth_that_are_far_apart_are_told_with_the_gap(make_bench: Callable[..., Bench]) -> None:
@@ -150,7 +150,7 @@ def test_colour_and_depth_that_are_far_apart_are_told_with_the_gap(make_bench: C
     bench.feed(2 * SECOND, depth_delay_ns=0)
     assert 'from its colour' not in bench.said()
     bench.feed(3 * SECOND, depth_delay_ns=-45_000_000)
-    assert len(bench.intake.flush()) == 1
+    assert len(bench.assembler.flush()) == 1
     assert 'depth is -0.045 s from its colour' in bench.said()
 
 
@@ -168,8 +168,8 @@ def test_frames_that_the_gate_keeps_out_are_not_decoded(make_bench: Callable[...
     broken = images.color_message(MAKE, RGB, SECOND, '')
     broken.encoding = 'nv99'
     bench.feed(SECOND)
-    bench.intake.color(broken)
-    assert bench.skipped == [SECOND] and 'left out' not in bench.said()
+    bench.assembler.add_color(broken)
+    assert bench.rejected == [SECOND] and 'skipped' not in bench.said()
 
 
 def test_a_jump_back_begins_an_epoch(make_bench: Callable[..., Bench]) -> None:

@@ -39,7 +39,7 @@ def test_a_constant_twist_is_found_in_the_bodys_axes(estimator: MotionEstimator)
 
 def test_over_a_gap_in_which_the_camera_was_lost_there_is_no_velocity(estimator: MotionEstimator) -> None:
     observe(estimator, 0, np.eye(4))
-    estimator.lost()
+    estimator.interrupt()
     motion = observe(estimator, 9, se3.exp(TWIST))
     assert (motion.twist == 0).all() and (np.diag(motion.twist_covariance) == UNKNOWN_VARIANCE).all()
 

@@ -131,10 +131,10 @@ def test_what_may_change_at_run_time_is_handed_on(make_node: MakeNode) -> None:
 @pytest.mark.parametrize(
     ('values', 'reason'),
     [
-        ({'preset': 'tum'}, 'preset cannot change while the node runs: it is what all other settings start from'),
+        ({'preset': 'tum'}, 'preset cannot change while the node runs: all other settings start from it'),
         ({'width': 320}, 'width cannot change while the node runs: frames of another size'),
         ({'sync__mode': 'exact'}, 'sync.mode cannot change while the node runs: it is read when the node starts'),
-        ({'slam__threads': 2}, 'slam.threads cannot change while the node runs: the threads are running'),
+        ({'slam__threads': 2}, 'slam.threads cannot change while the node runs: the threads are already running'),
         ({'save_path': '/tmp/elsewhere'}, 'save_root is empty'),
         ({'max_rate_hz': -1.0}, 'max_rate_hz out of range'),
         ({'slam__tracking__iterations': -1}, 'slam.tracking.iterations out of range'),
