@@ -1,9 +1,9 @@
-"""A camera for benchmarks: publishes the images of a bag at a fixed rate, whether anybody keeps up or not.
+"""A camera for benchmarks: publishes the images of a bag at a fixed rate and waits for no subscriber.
 
     python benchmarks/camera.py BAG LOG [--rate 30] [--frames N] [--now]
 
-BAG is one of ``splatam convert``'s; all of it is in memory before the first frame. Waits for subscribers of all topics.
-LOG gets a line a frame: its stamp, and when the later of its two images was handed to ROS (wall clock), in nanoseconds.
+``splatam convert`` wrote BAG, which is read into memory before the first frame. Publishing starts when every topic has a subscriber.
+LOG gets a line for each frame: its stamp, and the wall time at which the later of its two images was handed to ROS, in nanoseconds.
 """
 
 from __future__ import annotations
@@ -20,8 +20,10 @@ import rclpy
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from splatam_core.datasets.rosbag import DEPTH_TOPIC, INFO_TOPIC, RGB_TOPIC
-from splatam_ros.player.recording import Recording, stamp_of
+from msg_adapters.factory import message_class
+from msg_adapters.stamps import serialized_stamp_ns
+from splatam_core.datasets.bag.recording import Recording
+from splatam_core.datasets.bag.topics import DEPTH_TOPIC, INFO_TOPIC, RGB_TOPIC
 from splatam_ros.process import StopRequest, ros
 
 TOPICS = (INFO_TOPIC, RGB_TOPIC, DEPTH_TOPIC)
@@ -31,20 +33,20 @@ Frame = dict[str, bytes]
 
 
 def frames_of(recording: Recording) -> list[Frame]:
-    """The serialized messages of each stamp that has all three."""
+    """Returns the serialized messages of each stamp that has all three topics."""
     by_stamp: dict[int, Frame] = {}
     for message in recording.messages(TOPICS):
-        by_stamp.setdefault(stamp_of(message.data), {})[message.topic] = message.data
+        by_stamp.setdefault(serialized_stamp_ns(message.data), {})[message.topic] = message.data
     return [frame for frame in by_stamp.values() if len(frame) == len(TOPICS)]
 
 
 def stamped(data: bytes, stamp_ns: int) -> bytes:
-    """A serialized message with another stamp; little endian, as bags are written."""
+    """Returns a serialized message (little endian) with its stamp replaced."""
     return data[:4] + struct.pack('<iI', *divmod(stamp_ns, 10**9)) + data[12:]
 
 
 def due_times(rate_hz: float) -> Iterator[float]:
-    """Monotonic seconds at which frames are due; what was missed is not caught up."""
+    """Yields the monotonic times, in seconds, at which frames are due. A late frame delays those after it."""
     due_s = time.monotonic()
     while True:
         yield due_s
@@ -52,14 +54,14 @@ def due_times(rate_hz: float) -> Iterator[float]:
 
 
 def publish(publishers: dict[str, Publisher], frames: list[Frame], args: argparse.Namespace, stop: StopRequest) -> Iterator[str]:
-    """Publish; yields the lines of the log."""
+    """Publish the frames. Yields the lines of the log."""
     count = args.frames or len(frames)
     for frame, due_s in zip(islice(cycle(frames), count), due_times(args.rate)):
         while not stop.requested and (left_s := due_s - time.monotonic()) > 0:
             time.sleep(left_s)
         if stop.requested:
             return
-        stamp_ns = time.time_ns() if args.now else stamp_of(frame[RGB_TOPIC])
+        stamp_ns = time.time_ns() if args.now else serialized_stamp_ns(frame[RGB_TOPIC])
         for topic in TOPICS:
             data = stamped(frame[topic], stamp_ns) if args.now else frame[topic]
             handed_over_ns = time.time_ns()
@@ -73,13 +75,14 @@ def main() -> None:
     parser.add_argument('bag', type=Path)
     parser.add_argument('log', type=Path)
     parser.add_argument('--rate', type=float, default=30.0)
-    parser.add_argument('--frames', type=int, help='loop until so many are out (default: once through the bag)')
+    parser.add_argument('--frames', type=int, help='number of frames; the bag is repeated as needed (default: the whole bag, once)')
     parser.add_argument('--now', action='store_true', help='stamp with the time of publishing')
     args = parser.parse_args()
     with Recording(args.bag) as recording, StopRequest() as stop, ros(()):
         frames = frames_of(recording)
         node = rclpy.create_node('camera')
-        publishers = {topic: node.create_publisher(recording.topics[topic].message_class, topic, AS_DRIVERS_DO) for topic in TOPICS}
+        classes = {topic: message_class(recording.topics[topic].type_name) for topic in TOPICS}
+        publishers = {topic: node.create_publisher(classes[topic], topic, AS_DRIVERS_DO) for topic in TOPICS}
         deadline_s = time.monotonic() + DISCOVERY_S
         while not (stop.requested or all(item.get_subscription_count() for item in publishers.values())):
             if time.monotonic() > deadline_s:
@@ -87,7 +90,7 @@ def main() -> None:
             time.sleep(0.05)
         with args.log.open('w') as log:
             log.writelines(publish(publishers, frames, args, stop))
-        time.sleep(1.0)  # for what was published last to be taken
+        time.sleep(1.0)  # so that the subscribers can take the last messages
 
 
 if __name__ == '__main__':

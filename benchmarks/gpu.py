@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatam_core.config import apply_threads, load_config
-from splatam_core.datasets import open_sequence
+from splatam_core.datasets.registry import open_sequence
 from splatam_core.evaluation.images import ViewScorer
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera

@@ -1,4 +1,4 @@
-"""What the benchmarks of the running node share: its processes, what they cost, and the poses that come out."""
+"""Shared by the benchmarks of the running node: child processes, their CPU and memory use, and received messages."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
+from msg_adapters.stamps import serialized_stamp_ns
 from splatam_ros.demo import graph_environment
-from splatam_ros.player.recording import stamp_of
 from splatam_ros.process import ros
 
 HERE = Path(__file__).parent
@@ -28,10 +28,11 @@ RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class Child:
-    """A process that is measured. Its log is there to be read when something goes wrong."""
+    """A process whose CPU and memory use are measured. Its output goes to a log file, to be read when something fails."""
 
     def __init__(self, command: list[str], log: Path) -> None:
         self.log = log
+        self._command = command
         with log.open('wb') as output:
             self._process = subprocess.Popen(
                 [sys.executable, *command], stdin=subprocess.DEVNULL, stdout=output, stderr=output,
@@ -40,20 +41,20 @@ class Child:
 
     @property
     def is_running(self) -> bool:
-        """Whether it has not ended."""
+        """True until the process ends."""
         return self._process.poll() is None
 
     def require(self, exit_code: int) -> None:
-        """Wait for the end.
+        """Wait for the process to end.
 
         Raises:
-            SystemExit: it ended otherwise.
+            SystemExit: its exit code is another one.
         """
         if (code := self._process.wait(STOP_TIMEOUT_S)) != exit_code:
-            sys.exit(f'{self._process.args[1:]} ended with exit code {code}; it said:\n{self.log.read_text()}')
+            sys.exit(f'{self._command} ended with exit code {code}; its output:\n{self.log.read_text()}')
 
     def stop(self) -> None:
-        """SIGINT, and wait."""
+        """Send SIGINT and wait."""
         if self.is_running:
             self._process.send_signal(signal.SIGINT)
             try:
@@ -63,24 +64,24 @@ class Child:
                 self._process.wait()
 
     def cpu_s(self) -> float:
-        """Processor time so far, of all its threads."""
+        """Returns the CPU time of all its threads so far, in seconds."""
         fields = Path(f'/proc/{self._process.pid}/stat').read_text().rpartition(')')[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
     def rss_mb(self) -> float:
-        """Memory it holds now, MiB."""
+        """Returns its resident memory, in MiB."""
         pages = int(Path(f'/proc/{self._process.pid}/statm').read_text().split()[1])
         return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
 
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """A message with a header, as it came.
+    """When a message with a header was stamped, published and received.
 
     Attributes:
-        stamp_ns: its header's.
-        published_ns: when its publisher handed it over, wall clock.
-        received_ns: when this process took it, wall clock.
+        stamp_ns: stamp of its header.
+        published_ns: wall time at which the publisher handed it over.
+        received_ns: wall time at which this process took it.
     """
 
     stamp_ns: int
@@ -89,7 +90,7 @@ class Arrival:
 
 
 class Graph:
-    """A ROS graph of this benchmark's own: child processes, and a node that listens."""
+    """The ROS graph of one benchmark: child processes, and a node that subscribes to their topics."""
 
     def __init__(self, node: Node, folder: Path) -> None:
         self.node = node
@@ -99,7 +100,7 @@ class Graph:
         self._executor.add_node(node)
 
     def start(self, *command: str) -> Child:
-        """Start ``python command``."""
+        """Run ``python command``."""
         child = Child(list(command), self._folder / f'{len(self._children)}.log')
         self._children.append(child)
         return child
@@ -123,17 +124,18 @@ class Graph:
         arrivals: list[Arrival] = []
 
         def receive(data: bytes, info: dict[str, int]) -> None:
-            arrivals.append(Arrival(stamp_of(data), info['source_timestamp'], time.time_ns()))
+            arrivals.append(Arrival(serialized_stamp_ns(data), info['source_timestamp'], time.time_ns()))
 
-        self.node.create_subscription(message_class, topic, receive, RELIABLE, raw=True)
+        # rclpy accepts a callback that takes the message's info; its annotation does not know it.
+        self.node.create_subscription(message_class, topic, receive, RELIABLE, raw=True)  # type: ignore[arg-type]
         return arrivals
 
     def drain(self, topic: str, message_class: type) -> None:
-        """Subscribe, so that somebody listens, and keep nothing."""
+        """Subscribe, so that the publisher has a subscriber, and keep nothing."""
         self.node.create_subscription(message_class, topic, lambda data: None, RELIABLE, raw=True)
 
     def spin_until(self, condition: Callable[[], object], timeout_s: float) -> bool:
-        """Take messages until a condition is met. Whether it was in time."""
+        """Take messages until a condition is met. Returns False if that took longer than ``timeout_s``."""
         deadline_s = time.monotonic() + timeout_s
         while not condition():
             if time.monotonic() > deadline_s:
@@ -146,7 +148,7 @@ class Graph:
         self.spin_until(lambda: False, seconds)
 
     def cpu_percent(self, child: Child, seconds: float) -> float:
-        """Take messages for some time, and see what a process needs meanwhile, percent of one core."""
+        """Take messages for some time. Returns the CPU load of a process meanwhile, in percent of one core."""
         cpu_s, wall_s = child.cpu_s(), time.monotonic()
         self.spin_for(seconds)
         return 100 * (child.cpu_s() - cpu_s) / (time.monotonic() - wall_s)
@@ -161,10 +163,10 @@ class Graph:
 
 @contextmanager
 def graph(folder: Path) -> Iterator[Graph]:
-    """A graph that meets no other; its processes are gone afterwards.
+    """Opens a graph that is isolated from others, and ends its processes afterwards.
 
     Args:
-        folder: for logs.
+        folder: where the processes' logs go.
     """
     folder.mkdir(parents=True, exist_ok=True)
     os.environ.update(graph_environment(os.environ, os.getpid()))
@@ -177,7 +179,7 @@ def graph(folder: Path) -> Iterator[Graph]:
 
 
 def convert(source: str, bag: Path, width: int, max_frames: int | None = None) -> None:
-    """Turn any source into a bag with the node's topic names."""
+    """Convert any source to a bag with the node's topic names."""
     cut = ['--max-frames', str(max_frames)] if max_frames else []
     command = ['-m', 'splatam_core.cli', 'convert', source, str(bag), '--width', str(width), *cut]
     subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)

@@ -22,7 +22,7 @@ from live import HERE, Arrival, Graph, convert, graph
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
-from splatam_core.datasets.rosbag import DEPTH_TOPIC, INFO_TOPIC, RGB_TOPIC
+from splatam_core.datasets.bag.topics import DEPTH_TOPIC, INFO_TOPIC, RGB_TOPIC
 
 RATE_HZ = 30.0
 TOPICS = ((RGB_TOPIC, Image), (DEPTH_TOPIC, Image), (INFO_TOPIC, CameraInfo))

@@ -12,7 +12,7 @@ import torch
 from header import print_header
 
 from splatam_core.config import apply_threads, load_config
-from splatam_core.datasets import open_sequence
+from splatam_core.datasets.registry import open_sequence
 from splatam_core.images.view import View
 from splatam_core.rasterizer import make_rasterizer
 from splatam_core.slam import Slam
@@ -21,7 +21,7 @@ from splatam_core.types import RgbdFrame
 
 def bias_mm(frame: RgbdFrame, settle: int, steps: int) -> float:
     """Mean depth bias of the map after its first frame, millimetres."""
-    config = load_config('quick', {'threads': 1, 'densification.settle': settle, 'mapping.iterations': steps})
+    config = load_config('quick', {'threads': 1, 'densification.bias_correction_rounds': settle, 'mapping.iterations': steps})
     slam = Slam(config)
     slam.process(frame)
     view = View.from_frame(frame, config.depth)

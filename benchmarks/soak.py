@@ -22,8 +22,8 @@ from live import Child, Graph, convert, graph
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
+from msg_adapters.factory import message_class
 from splatam_ros.node.outputs import OUTPUTS
-from splatam_ros.player.recording import message_class
 
 START_TIMEOUT_S = 60.0
 SETTLING = 0.25  # share of the time that memory may grow: caches, allocators, the first map

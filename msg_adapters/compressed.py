@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters import stamps
-from msg_adapters.encodings import Depth, Rgb, clean_metres, metres_from_counts
+from msg_adapters.encodings import Depth, DepthEncoding, Rgb, clean_metres, metres_from_counts
 from msg_adapters.errors import MessageError
 from msg_adapters.factory import MessageFactory
 from msg_adapters.pixels import checked_depth, checked_rgb, millimetres
@@ -119,7 +119,7 @@ def compressed_depth_message(
     depth_m: Depth,
     stamp_ns: int,
     frame_id: str,
-    encoding: Literal['16UC1', '32FC1'] = '16UC1',
+    encoding: DepthEncoding = '16UC1',
 ) -> Any:
     """A ``sensor_msgs/CompressedImage`` of [H, W] metres, as image_transport's compressedDepth plugin writes it.
 

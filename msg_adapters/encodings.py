@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -15,6 +15,9 @@ from msg_adapters.errors import MessageError
 
 Rgb = NDArray[np.uint8]
 Depth = NDArray[np.float32]
+DepthEncoding = Literal['16UC1', '32FC1']
+"""The encodings of depth that are written."""
+
 MILLIMETRES_PER_METRE = np.float32(1000)
 MILLIMETRE = 0.001
 

@@ -1,4 +1,4 @@
-"""Who makes the messages: rclpy's classes (to publish) or rosbags' (to write a bag).
+"""Makes messages of rclpy's classes (to publish) or rosbags' (to write a bag).
 
 The builders in this package name the message type and give every field; arrays are numpy arrays.
 """
@@ -26,7 +26,9 @@ class MessageFactory(Protocol):
 class TypeStore(Protocol):
     """The part of rosbags' ``Typestore`` that is used here."""
 
-    types: Mapping[str, Any]
+    @property
+    def types(self) -> Mapping[str, Any]:
+        """Message classes by name."""
 
 
 class RclpyMessages:
@@ -39,7 +41,7 @@ class RclpyMessages:
             MessageError: the message's package is not installed, or has no such message.
         """
         values = {name: _rclpy_value(value) for name, value in fields.items()}
-        return _message_class(type_name)(**values)
+        return message_class(type_name)(**values)
 
 
 class RosbagsMessages:
@@ -54,26 +56,34 @@ class RosbagsMessages:
         Raises:
             MessageError: the typestore does not know the type.
         """
-        message_class = self._types.get(type_name)
-        if message_class is None:
+        cls = self._types.get(type_name)
+        if cls is None:
             raise MessageError(f"message type '{type_name}' is not in the typestore; register it first")
-        return message_class(**fields)
+        return cls(**fields)
 
 
 @cache
-def _message_class(type_name: str) -> type:
+def message_class(type_name: str) -> type:
+    """Import rclpy's class of a message type.
+
+    Args:
+        type_name: such as ``sensor_msgs/msg/Image``.
+
+    Raises:
+        MessageError: the message's package is not installed, or has no such message.
+    """
     package, _, name = type_name.partition('/msg/')
     try:
         return getattr(importlib.import_module(f'{package}.msg'), name)
     except (ImportError, AttributeError) as error:
         raise MessageError(
-            f"message type '{type_name}' is not installed ({error}); source a ROS 2 workspace that has it, "
+            f'message type {type_name} is not installed ({error}); source a ROS 2 workspace that has it, '
             "or pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces"
         ) from None
 
 
 def _rclpy_value(value: Any) -> Any:
-    """Numpy arrays as rclpy's fields take them; bytes by array.array, other ways are 10 to 1000 times slower."""
+    """Convert numpy arrays to what rclpy's fields take; for bytes, anything but array.array is 10 to 1000 times slower."""
     if not isinstance(value, np.ndarray):
         return value
     if value.dtype != np.uint8:

@@ -6,14 +6,14 @@ never come out of here.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters import compressed, encodings, stamps
 from msg_adapters.compressed import compressed_color_message, compressed_depth_message
-from msg_adapters.encodings import MILLIMETRE, Depth, Rgb
+from msg_adapters.encodings import MILLIMETRE, Depth, DepthEncoding, Rgb
 from msg_adapters.errors import MessageError
 from msg_adapters.factory import MessageFactory
 from msg_adapters.pixels import checked_depth, checked_mono, checked_rgb, millimetres
@@ -83,7 +83,7 @@ def depth_message(
     depth_m: Depth,
     stamp_ns: int,
     frame_id: str,
-    encoding: Literal['32FC1', '16UC1'] = '32FC1',
+    encoding: DepthEncoding = '32FC1',
 ) -> Any:
     """A depth ``sensor_msgs/Image`` of [H, W] metres, 0 = no reading.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 from msg_adapters.errors import MessageError
@@ -30,6 +31,22 @@ def from_ns(stamp_ns: int) -> tuple[int, int]:
 def message_stamp_ns(message: Any) -> int:
     """Nanoseconds of a message's header stamp."""
     return to_ns(message.header.stamp)
+
+
+def serialized_stamp_ns(data: bytes) -> int:
+    """Nanoseconds of the stamp that the CDR bytes of a message begin with, without decoding the rest.
+
+    Args:
+        data: a serialized message whose first field is a ``std_msgs/Header`` or a ``builtin_interfaces/Time``.
+
+    Raises:
+        MessageError: there are too few bytes.
+    """
+    if len(data) < 12:
+        raise MessageError(f'has {len(data)} bytes, too few for a header')
+    byte_order = '<' if data[1] & 1 else '>'  # the second of four bytes that tell the encoding
+    seconds, nanoseconds = struct.unpack_from(f'{byte_order}iI', data, 4)
+    return seconds * NANOSECONDS + nanoseconds
 
 
 def header(factory: MessageFactory, stamp_ns: int, frame_id: str) -> Any:

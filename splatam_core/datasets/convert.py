@@ -1,4 +1,4 @@
-"""Any recording as a rosbag2, in one step: the bag is there complete, or not at all."""
+"""Writes any recording as a rosbag2, in one step: the bag is there complete, or not at all."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ def write_bag(
 ) -> None:
     """Write a recording as a rosbag2 folder that ``open_sequence`` reads back the same, bit for bit.
 
-    Topics: ``/rgb/image`` (rgb8), ``/depth/image`` (16UC1 where the recording counts millimetres, else
-    32FC1), ``/rgb/camera_info`` (without distortion), ``/ground_truth/pose`` (where the truth is
-    known). Messages have the recording's stamps, and are recorded at them.
+    Topics: ``/rgb/image`` (rgb8), ``/depth/image`` (16UC1 if the recording stores millimetres, else
+    32FC1), ``/rgb/camera_info`` (without distortion), ``/ground_truth/pose`` (if the ground truth is
+    known). Messages keep the recording's stamps, which are also their times of recording.
 
     Args:
         sequence: what to write.
-        path: the folder to make; must not exist.
+        path: the folder to create; must not exist.
         storage: ``sqlite3`` or ``mcap``.
         compressed: write JPEG to ``/rgb/image/compressed`` and PNG to ``/depth/image/compressedDepth``
-            instead; colours then come back slightly different, and depth too unless it is in millimetres.
-        progress: wraps the indices of the frames as they are written, to draw a progress bar.
+            instead. Colours then change slightly, and so does depth unless it is in millimetres.
+        progress: wraps the frames' indices as they are written, for a progress bar.
 
     Raises:
         DatasetError: the path exists or cannot be written, or a frame cannot be read.
@@ -46,19 +46,19 @@ def write_bag(
     path = Path(path)
     if path.exists() or path.is_symlink():
         raise DatasetError(f'{path}: exists already; remove it or choose another name')
-    from splatam_core.datasets import rosbag  # the bag library is only loaded where a bag is read or written
+    from splatam_core.datasets.bag.writer import write  # loads the bag library only where a bag is written
 
     indices = range(len(sequence))
     try:
         with _complete_or_absent(path) as folder:
-            rosbag.write(sequence, folder, storage, compressed, progress(indices) if progress else indices)
+            write(sequence, folder, storage, compressed, progress(indices) if progress else indices)
     except (OSError, sqlite3.Error) as error:
         raise DatasetError(f'{path}: cannot be written: {error}') from None
 
 
 @contextmanager
 def _complete_or_absent(path: Path) -> Iterator[Path]:
-    """A folder of the same name in a hidden place beside it; moved to ``path`` when the block is through."""
+    """Yield a folder to write, hidden beside ``path``; it is moved to ``path`` if the block ends without an error."""
     path.parent.mkdir(parents=True, exist_ok=True)
     hidden = Path(tempfile.mkdtemp(prefix=f'.{path.name}.', suffix='.partial', dir=path.parent))
     try:

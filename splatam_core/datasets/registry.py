@@ -21,7 +21,7 @@ READERS = {
     'record3d': 'splatam_core.datasets.record3d',
     'icl': 'splatam_core.datasets.icl',
     'folder': 'splatam_core.datasets.folder',
-    'rosbag': 'splatam_core.datasets.rosbag',
+    'rosbag': 'splatam_core.datasets.bag.sequence',
 }
 """Format name to module. A module holds its row as ``FORMAT`` and is imported when it is looked at."""
 

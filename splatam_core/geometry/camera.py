@@ -60,14 +60,37 @@ class PinholeCamera:
 class Intrinsics(Protocol):
     """Whatever states a camera: a CameraInfo adapter's result, a ``camera.yaml``."""
 
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion_model: str
-    distortion: tuple[float, ...]
+    @property
+    def width(self) -> int:
+        """Image width in pixels."""
+
+    @property
+    def height(self) -> int:
+        """Image height in pixels."""
+
+    @property
+    def fx(self) -> float:
+        """Focal length along x in pixels."""
+
+    @property
+    def fy(self) -> float:
+        """Focal length along y in pixels."""
+
+    @property
+    def cx(self) -> float:
+        """The principal point's x in pixels."""
+
+    @property
+    def cy(self) -> float:
+        """The principal point's y in pixels."""
+
+    @property
+    def distortion_model(self) -> str:
+        """``none``, ``plumb_bob``, ``rational_polynomial`` or ``equidistant``."""
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """Coefficients in OpenCV's order."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
-"""Who steers the player: keys, services and the node's parameter ``rate``."""
+"""Controls of the player: keys, services and the parameter ``rate``."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
@@ -15,27 +15,27 @@ from splatam_ros.player.pacing import PlaybackClock
 
 RATE_STEP = 1.1
 Outcome = tuple[bool, str]
-"""Whether a command did something, and what there is to say."""
+"""True if a command changed something (or the answer of ``is_paused``), and the message for the caller."""
 
 
 class Controls:
     """Pause, step, rate and stop.
 
-    The services are of ``std_srvs/Trigger``, which every ROS has; the standard player's own types come with rosbag2.
+    The services are of type ``std_srvs/Trigger``, which every ROS has. Those of ``ros2 bag play`` need rosbag2's types.
 
     Attributes:
-        is_paused: whether messages wait.
-        is_stopped: whether playback should end.
+        is_paused: True while messages are held back.
+        is_stopped: True if playback should end.
     """
 
     def __init__(self, node: Node, clock: PlaybackClock, keyboard: Keyboard, say: Callable[[str], None]) -> None:
-        """Offer services and parameter.
+        """Create the services and the parameter.
 
         Args:
-            node: whose they are.
-            clock: frozen while paused.
-            keyboard: may be attached or not.
-            say: tells the user what has changed.
+            node: gets the services and the parameter.
+            clock: is frozen while paused.
+            keyboard: need not be attached to a terminal.
+            say: shows a message to the user.
         """
         self.is_paused = self.is_stopped = False
         self._node = node
@@ -52,17 +52,17 @@ class Controls:
         self._offer_rate()
 
     def pause(self) -> Outcome:
-        """Let messages wait."""
+        """Hold messages back."""
         if self.is_paused:
             return False, 'paused already'
         self.is_paused = True
         self._clock.freeze()
-        keys = 'space goes on, cursor right plays one message' if self._keyboard.is_attached else '~/resume goes on'
+        keys = 'space resumes, cursor right plays one message' if self._keyboard.is_attached else 'the service ~/resume resumes'
         self._say(f'paused ({keys})')
         return True, 'paused'
 
     def resume(self) -> Outcome:
-        """Go on."""
+        """Play on."""
         if not self.is_paused:
             return False, 'playing already'
         self.is_paused = False
@@ -72,11 +72,11 @@ class Controls:
         return True, 'playing'
 
     def toggle_paused(self) -> Outcome:
-        """Pause or go on."""
+        """Pause or resume."""
         return self.resume() if self.is_paused else self.pause()
 
     def play_next(self) -> Outcome:
-        """Let one message out although paused."""
+        """Play one message while paused."""
         if not self.is_paused:
             return False, 'only while paused'
         self._steps += 1
@@ -88,13 +88,13 @@ class Controls:
         return True, 'stopping'
 
     def take_step(self) -> bool:
-        """Whether a message may go out although paused; uses up a step."""
+        """Returns True if a message may be played while paused; uses up one step."""
         self._steps -= (may_go := self._steps > 0)
         return may_go
 
-    def look_at_keys(self) -> None:
-        """Do what the keys pressed since the last look ask for."""
-        actions = {
+    def handle_keys(self) -> None:
+        """Act on the keys that were pressed since the last call."""
+        actions: Mapping[Key, Callable[[], object]] = {
             Key.SPACE: self.toggle_paused,
             Key.RIGHT: self.play_next,
             Key.UP: partial(self._scale_rate, RATE_STEP),
@@ -106,8 +106,8 @@ class Controls:
     # --- rate ---
 
     def _offer_rate(self) -> None:
-        description = 'Speed of playback, more than 0; shows 0 while as fast as listeners allow.'
-        descriptor = ParameterDescriptor(description=description, dynamic_typing=True)  # whole numbers are welcome
+        description = 'Speed of playback relative to the recording, above 0; reads 0 while playing as fast as the listeners allow.'
+        descriptor = ParameterDescriptor(description=description, dynamic_typing=True)  # accepts integers too
         self._node.declare_parameter('rate', self._clock.rate or 0.0, descriptor, ignore_override=True)
         self._node.add_on_set_parameters_callback(_check_rate)
         self._node.add_post_set_parameters_callback(self._apply_rate)
@@ -120,7 +120,7 @@ class Controls:
 
     def _scale_rate(self, factor: float) -> None:
         if self._clock.rate is None:
-            self._say('already as fast as listeners allow')
+            self._say('already as fast as the listeners allow')
         else:
             self._node.set_parameters([Parameter('rate', value=self._clock.rate * factor)])
 

@@ -1,4 +1,4 @@
-"""Single key presses from the terminal, if there is one."""
+"""Reads single key presses from the terminal, if there is one."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import termios
 import tty
 from enum import Enum
 from types import TracebackType
+from typing import Any
 
 
 class Key(Enum):
-    """The keys that mean something."""
+    """The keys that the player understands."""
 
     SPACE = 'space'
     RIGHT = 'cursor right'
@@ -28,26 +29,26 @@ SEQUENCES = {
 
 
 class Keyboard:
-    """Reads keys without waiting for Enter while its ``with`` lasts; stays silent away from a terminal."""
+    """Reads keys without waiting for Enter, as a context manager. Without a terminal, no key is ever pressed."""
 
     def __init__(self, is_enabled: bool = True) -> None:
         """Prepare.
 
         Args:
-            is_enabled: whether to touch the terminal at all.
+            is_enabled: False to leave the terminal alone.
         """
         self._is_enabled = is_enabled
         self._terminal: int | None = None
-        self._settings: list[object] = []
+        self._settings: list[Any] = []
         self._typed = ''
 
     @property
     def is_attached(self) -> bool:
-        """Whether key presses can come."""
+        """True if keys are read from a terminal."""
         return self._terminal is not None
 
     def pressed(self) -> list[Key]:
-        """The keys pressed since the last call."""
+        """Returns the keys pressed since the last call."""
         if self._terminal is None or not select.select([self._terminal], [], [], 0)[0]:
             return []
         self._typed += os.read(self._terminal, 64).decode(errors='ignore')
@@ -73,13 +74,13 @@ class Keyboard:
 
 
 def _is_beginning(typed: str) -> bool:
-    """Whether the rest of a key's sequence is still to come."""
+    """Returns True if the characters are the beginning of a key's escape sequence."""
     return any(sequence.startswith(typed) and sequence != typed for sequence in SEQUENCES)
 
 
 def _is_background_job(terminal: int) -> bool:
-    """Whether the shell would stop us for touching the terminal."""
+    """Returns True if this process is in the background: changing the terminal would stop it."""
     try:
         return os.tcgetpgrp(terminal) != os.getpgrp()
-    except OSError:  # not the terminal that controls us, so nobody does
+    except OSError:  # it is not our controlling terminal
         return False

@@ -1,4 +1,4 @@
-"""Who listens to the player, and what they answer."""
+"""The subscribers that the player plays for, and the topics on which they report processed frames."""
 
 from __future__ import annotations
 
@@ -8,66 +8,77 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
-from splatam_ros.player.recording import COLOR_OR_DEPTH, message_class, stamp_of, starts_with_stamp
+from msg_adapters.errors import MessageError
+from msg_adapters.factory import message_class
+from msg_adapters.stamps import serialized_stamp_ns
+from splatam_core.datasets.bag.typestore import IMAGES
 from splatam_ros.process import RosError
 
+HEADER = ('header', 'std_msgs/Header')
+STAMP = ('stamp', 'builtin_interfaces/Time')
 
-class Answers:
-    """The stamps of messages on a topic: each says that the frame of this stamp is done."""
 
-    def __init__(self, node: Node, topic: str, on_answer: Callable[[int], None]) -> None:
-        """Prepare; ``discover`` subscribes as soon as somebody publishes the topic.
+class AnswerTopic:
+    """A topic whose messages answer frames: a message means that the frame with its stamp has been processed.
+
+    Attributes:
+        name: of the topic.
+    """
+
+    def __init__(self, node: Node, name: str, on_answer: Callable[[int], None]) -> None:
+        """Prepare; ``discover`` subscribes once the topic has a publisher.
 
         Args:
-            node: to subscribe with.
-            topic: of any type that begins with a header.
-            on_answer: called by the executor with each stamp, ns.
+            node: subscribes.
+            name: of the topic, whose type must begin with a header or a stamp.
+            on_answer: called by the executor with each stamp in nanoseconds.
         """
-        self.topic = topic
+        self.name = name
         self._node = node
         self._on_answer = on_answer
         self._is_subscribed = False
 
     def discover(self) -> bool:
-        """Subscribe if somebody publishes by now. Whether we are subscribed.
+        """Subscribe if the topic has a publisher by now. Returns True once subscribed.
 
         Raises:
             RosError: the topic's type is not installed, or has no header.
         """
         if not self._is_subscribed:
-            for publisher in self._node.get_publishers_info_by_topic(self.topic)[:1]:
+            for publisher in self._node.get_publishers_info_by_topic(self.name)[:1]:
                 cls = self._message_class(publisher.topic_type)
                 qos = QoSProfile(depth=10, reliability=publisher.qos_profile.reliability)
-                self._node.create_subscription(cls, self.topic, self._receive, qos, raw=True)
+                self._node.create_subscription(cls, self.name, self._receive, qos, raw=True)
                 self._is_subscribed = True
         return self._is_subscribed
 
     @property
     def is_gone(self) -> bool:
-        """Whether the topic was there and has no publisher any more."""
-        return self._is_subscribed and self._node.count_publishers(self.topic) == 0
+        """True if the topic had a publisher and has none any more."""
+        return self._is_subscribed and self._node.count_publishers(self.name) == 0
 
     def _message_class(self, type_name: str) -> type:
         try:
             cls = message_class(type_name)
-        except LookupError as error:
-            raise RosError(f'--wait-for {self.topic}: {error}') from None
-        if not starts_with_stamp(cls):
-            raise RosError(f'--wait-for {self.topic}: its type {type_name} has no header, so no stamp to wait for')
+        except MessageError as error:
+            raise RosError(f'--wait-for {self.name}: {error}') from None
+        fields = cls.get_fields_and_field_types()  # type: ignore[attr-defined]  # every message class of rclpy has it
+        if next(iter(fields.items()), None) not in (HEADER, STAMP):
+            raise RosError(f'--wait-for {self.name}: its type {type_name} has no header, so no stamp to wait for')
         return cls
 
     def _receive(self, data: bytes) -> None:
-        self._on_answer(stamp_of(data))
+        self._on_answer(serialized_stamp_ns(data))
 
 
 class Listeners:
-    """The subscribers that the player waits for, and must not lose on the way."""
+    """The subscribers of some published topics: the player waits for them, and stops when they leave."""
 
     def __init__(self, node: Node, publishers: Mapping[str, Publisher]) -> None:
-        """Watch some topics.
+        """Choose the topics.
 
         Args:
-            node: to ask the graph with.
+            node: asks the graph.
             publishers: by name of the topic on the graph.
         """
         self._node = node
@@ -75,29 +86,29 @@ class Listeners:
         self._watched: set[str] = set()
 
     @property
-    def heard(self) -> list[str]:
-        """The topics that somebody subscribes to."""
+    def subscribed(self) -> list[str]:
+        """The topics that have a subscriber."""
         return [topic for topic, publisher in self._publishers.items() if publisher.get_subscription_count() > 0]
 
     @property
-    def unheard(self) -> list[str]:
-        """The topics that nobody subscribes to."""
-        heard = self.heard
-        return [topic for topic in self._publishers if topic not in heard]
+    def unsubscribed(self) -> list[str]:
+        """The topics that have no subscriber."""
+        subscribed = self.subscribed
+        return [topic for topic in self._publishers if topic not in subscribed]
 
     def watch(self) -> None:
-        """From now on ``gone`` tells which of the topics heard now are heard no more."""
-        self._watched = set(self.heard)
+        """Remember which topics have subscribers now, for ``lost``."""
+        self._watched = set(self.subscribed)
 
     @property
-    def gone(self) -> list[str]:
-        """Watched topics that have lost their last subscriber."""
-        return sorted(self._watched.intersection(self.unheard))
+    def lost(self) -> list[str]:
+        """Topics that had a subscriber when ``watch`` was called and have none any more."""
+        return sorted(self._watched.intersection(self.unsubscribed))
 
     def image_topics_wanted(self, besides: Collection[str]) -> list[str]:
-        """Image topics on the graph that somebody subscribes to."""
+        """Returns other image topics on the graph that have a subscriber."""
         return sorted(
             topic
             for topic, types in self._node.get_topic_names_and_types()
-            if topic not in besides and set(types).intersection(COLOR_OR_DEPTH) and self._node.count_subscribers(topic)
+            if topic not in besides and set(types).intersection(IMAGES) and self._node.count_subscribers(topic)
         )

@@ -1,4 +1,4 @@
-"""When the player may publish the next message: recording time, and the frames still unanswered."""
+"""Decides when the player may publish the next message: playback time, and frames that are not answered yet."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from splatam_core.geometry.trajectory import stamp_text
 
 
 class PlaybackClock:
-    """Recording time, running at some rate of wall time, and standing still while frozen."""
+    """Recording time that runs at a multiple of wall time, and stands still while frozen."""
 
     def __init__(self, start_ns: int, rate: float | None) -> None:
         """Start the clock.
 
         Args:
             start_ns: recording time now.
-            rate: recording seconds in a wall second; None = as fast as messages can be handed out.
+            rate: recording seconds per wall second; None = as fast as messages can be published.
         """
         self._rate = rate
         self._freezes = 0
@@ -28,7 +28,7 @@ class PlaybackClock:
 
     @property
     def rate(self) -> float | None:
-        """Recording seconds in a wall second; None = as fast as messages can be handed out."""
+        """Recording seconds per wall second; None = as fast as messages can be published."""
         return self._rate
 
     @rate.setter
@@ -37,7 +37,7 @@ class PlaybackClock:
         self._rate = rate
 
     def restart(self, start_ns: int) -> None:
-        """Go to some recording time."""
+        """Set the recording time."""
         self._anchor_ns = start_ns
         self._anchor_s = time.monotonic()
 
@@ -52,23 +52,23 @@ class PlaybackClock:
         return 0.0 if self._rate is None else (time_ns - self.now_ns()) / (self._rate * 1e9)
 
     def published(self, time_ns: int) -> None:
-        """Tell the clock which message went out; where time does not run by itself, that is what time it is."""
+        """Tell the clock that a message was published. While time does not run by itself, the message sets it."""
         if self._rate is None or self._freezes:
             self._anchor_ns = max(self._anchor_ns, time_ns)
 
     def freeze(self) -> None:
-        """Stop; undone by as many calls of ``thaw``."""
+        """Stop the clock; it runs again after as many calls of ``thaw``."""
         self._anchor_ns = self.now_ns()
         self._freezes += 1
 
     def thaw(self) -> None:
-        """Go on from where the clock stopped."""
+        """Let the clock run on from where it stopped."""
         self._freezes -= 1
         self._anchor_s = time.monotonic()
 
     @contextmanager
     def frozen(self) -> Iterator[None]:
-        """Stand still during a ``with``: what held the player up is not caught up afterwards."""
+        """Stop the clock during a ``with`` block, so that time spent waiting is not caught up afterwards."""
         self.freeze()
         try:
             yield
@@ -77,7 +77,7 @@ class PlaybackClock:
 
 
 class Lateness:
-    """How late messages went out, by the wall clock, the last of them."""
+    """How late the last messages were published, in wall time."""
 
     KEPT = 100_000
 
@@ -85,24 +85,24 @@ class Lateness:
         self._late_s: deque[float] = deque(maxlen=self.KEPT)
 
     def add(self, seconds: float) -> None:
-        """Of one message."""
+        """Record one message."""
         self._late_s.append(max(0.0, seconds))
 
     @property
     def p95_ms(self) -> float | None:
-        """What 95 % of the messages keep to, milliseconds; None before the first."""
+        """95th percentile of the lateness in milliseconds; None before the first message."""
         late_s = sorted(self._late_s)
         return 1e3 * late_s[math.ceil(0.95 * len(late_s)) - 1] if late_s else None
 
 
 @dataclass(slots=True)
-class HandedOut:
+class PublishedColor:
     """A colour image that was published and not answered yet.
 
     Attributes:
-        number: which colour image of the playback, from 1.
+        number: counts the colour images of the playback from 1.
         stamp_ns: its stamp.
-        is_complete: whether its depth has been published too.
+        is_complete: True if its depth image has been published too.
     """
 
     number: int
@@ -114,65 +114,65 @@ class HandedOut:
 
 
 class Backlog:
-    """Frames handed out and not answered. A frame is a colour image with its depth image.
+    """Frames that were published and not answered. A frame is a colour image with its depth image.
 
-    An image whose partner the recording lacks is no frame: nobody can answer it.
+    A colour image without depth image in the recording is no frame, because the node cannot answer it.
     """
 
     PAIR_WITHIN_NS = 20_000_000  # the node's sync.max_interval
-    NUM_DEPTHS = 100  # remembered; messages of one instant are close together in a recording
+    NUM_DEPTHS = 100  # depth stamps remembered; messages of one instant are close together in a recording
 
     def __init__(self, needs_depth: bool) -> None:
         """Start empty.
 
         Args:
-            needs_depth: whether a colour image is a frame only with its depth image.
+            needs_depth: True if a colour image is a frame only with its depth image.
         """
         self.num_colors = 0
         self._num_unpaired = 0
         self._needs_depth = needs_depth
-        self._unanswered: deque[HandedOut] = deque()
+        self._unanswered: deque[PublishedColor] = deque()
         self._depths_ns: deque[int] = deque(maxlen=self.NUM_DEPTHS)
 
     @property
     def waiting(self) -> int:
-        """Frames that somebody should answer."""
+        """Number of frames that are not answered."""
         return sum(image.is_complete for image in self._unanswered)
 
     @property
-    def first(self) -> HandedOut | None:
-        """The first frame not answered."""
+    def first(self) -> PublishedColor | None:
+        """The first frame that is not answered."""
         return next((image for image in self._unanswered if image.is_complete), None)
 
     @property
     def num_unpaired(self) -> int:
-        """Colour images without a depth image."""
+        """Number of colour images without a depth image."""
         return self._num_unpaired + sum(not image.is_complete for image in self._unanswered)
 
     def color(self, stamp_ns: int) -> None:
-        """A colour image was published."""
+        """Record that a colour image was published."""
         self.num_colors += 1
         is_complete = not self._needs_depth or any(self._pairs(stamp_ns, depth_ns) for depth_ns in self._depths_ns)
-        self._unanswered.append(HandedOut(self.num_colors, stamp_ns, is_complete))
+        self._unanswered.append(PublishedColor(self.num_colors, stamp_ns, is_complete))
 
     def depth(self, stamp_ns: int) -> None:
-        """A depth image was published."""
+        """Record that a depth image was published."""
         self._depths_ns.append(stamp_ns)
         for image in self._unanswered:
             image.is_complete |= self._pairs(image.stamp_ns, stamp_ns)
 
     def answered(self, stamp_ns: int) -> None:
-        """The frame of this stamp is done, and so is whatever came before it."""
+        """Record that the frame with this stamp, and all frames before it, are processed."""
         while self._unanswered and self._unanswered[0].stamp_ns <= stamp_ns:
             image = self._unanswered.popleft()
             self._num_unpaired += not image.is_complete and image.stamp_ns != stamp_ns
 
     def all_answered(self) -> None:
-        """Everything handed out so far has arrived."""
+        """Record that everything published so far has arrived."""
         self._unanswered.clear()
 
     def restart(self) -> None:
-        """The recording starts over: old stamps say nothing about new ones."""
+        """Forget all stamps, because the recording starts over."""
         self._num_unpaired = self.num_unpaired
         self._unanswered.clear()
         self._depths_ns.clear()

@@ -1,4 +1,4 @@
-"""Reads a recording ahead of playback, on a thread of its own: a slow disk does not make messages late."""
+"""Reads a recording ahead of playback on a thread of its own, so that a slow disk does not make messages late."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from collections import deque
 from collections.abc import Iterator
 from types import TracebackType
 
-from splatam_ros.player.recording import RawMessage
+from splatam_core.datasets.bag.recording import RawMessage
 
 
 class ReadAhead:
-    """Messages in their order, read before they are asked for. Use as a context manager; it joins the thread."""
+    """Messages in order, read before they are needed. Use it as a context manager, which ends the thread."""
 
     def __init__(self, messages: Iterator[RawMessage], size: int) -> None:
         """Start reading.
 
         Args:
-            messages: belongs to the thread from now on, and so does the file below it.
-            size: most messages to hold.
+            messages: is iterated by the thread only.
+            size: largest number of messages to hold.
         """
         self._messages = messages
         self._size = size
@@ -31,10 +31,10 @@ class ReadAhead:
 
     @property
     def is_over(self) -> bool:
-        """Whether every message has been taken.
+        """True if every message has been taken.
 
         Raises:
-            Exception: what ended reading, once all that was read before has been taken.
+            Exception: the error that ended reading, once all messages read before it have been taken.
         """
         with self._changed:
             if self._is_over and not self._waiting and self._error is not None:
@@ -42,7 +42,7 @@ class ReadAhead:
             return self._is_over and not self._waiting
 
     def take(self, timeout_s: float) -> RawMessage | None:
-        """The next message; None where there is none, or none within some time."""
+        """Returns the next message; None at the end, or if none was read in time."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._is_over, timeout_s)
             if not self._waiting:
@@ -64,14 +64,14 @@ class ReadAhead:
             for message in self._messages:
                 if not self._put(message):
                     break
-        except Exception as error:  # noqa: BLE001 - whatever it is, it surfaces where messages are taken
+        except Exception as error:  # noqa: BLE001 - raised where messages are taken
             self._error = error
         with self._changed:
             self._is_over = True
             self._changed.notify_all()
 
     def _put(self, message: RawMessage) -> bool:
-        """Queue a message as soon as there is room; False where nobody wants it any more."""
+        """Queue a message once there is capacity. Returns False if reading should end."""
         with self._changed:
             self._changed.wait_for(lambda: self._is_stopping or len(self._waiting) < self._size)
             self._waiting.append(message)

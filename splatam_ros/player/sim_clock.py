@@ -13,16 +13,16 @@ from splatam_ros.player.pacing import PlaybackClock
 
 
 class SimClock:
-    """Periodically, just before messages of some topics, or both. Time goes back only where playback does."""
+    """Publishes ``/clock`` periodically, just before messages of some topics, or both. Time goes back only at a restart."""
 
     def __init__(self, node: Node, clock: PlaybackClock, rate_hz: float | None, before: Collection[str]) -> None:
         """Prepare.
 
         Args:
-            node: to publish with; it does so only where there is something to publish.
-            clock: of playback.
-            rate_hz: updates a second, wall time; None = none.
-            before: the recorded topics before whose messages there is one.
+            node: publishes; it gets a publisher only if ``/clock`` is needed.
+            clock: tells the recording time.
+            rate_hz: updates per second of wall time; None = no periodic updates.
+            before: recorded topics before whose messages ``/clock`` is published.
         """
         self._publisher = node.create_publisher(Clock, '/clock', 10) if rate_hz or before else None
         self._clock = clock
@@ -33,22 +33,22 @@ class SimClock:
 
     @property
     def period_s(self) -> float:
-        """Wall time between two updates; infinite without."""
+        """Wall time between periodic updates; infinite without."""
         return self._period_s
 
     def restart(self) -> None:
-        """Time may go back once."""
+        """Allow time to go back once."""
         self._last_ns = 0
 
     def tick(self) -> None:
-        """Publish what is due."""
+        """Publish the periodic update if it is due."""
         now_s = time.monotonic()
         if self._period_s < float('inf') and now_s >= self._due_s:
             self._due_s = now_s + self._period_s
             self._publish(self._clock.now_ns())
 
-    def message_due(self, topic: str, time_ns: int) -> None:
-        """Tell that a message is about to be published."""
+    def before_message(self, topic: str, time_ns: int) -> None:
+        """Publish the time of a message that is about to be published, if its topic asks for it."""
         if topic in self._before:
             self._publish(time_ns)
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rosbags import rosbag1
 from rosbags.typesys import Stores, get_typestore
 
-from splatam_core.datasets import write_bag
+from splatam_core.datasets.convert import write_bag
 from splatam_core.datasets.room import build_room
 from splatam_core.datasets.synthetic import SyntheticSequence, Walk
 from splatam_core.geometry import se3

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from splatam_core.config import load_config
-from splatam_core.datasets import open_sequence
+from splatam_core.datasets.registry import open_sequence
 from splatam_core.errors import ConfigError, RasterizerError
 from splatam_core.geometry import se3
 from splatam_core.mapping.gaussian_map import GaussianMap

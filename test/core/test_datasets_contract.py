@@ -14,9 +14,9 @@ import pytest
 from dataset_layouts import CAMERA, COLOR_CAMERA, FLIP_Y_AND_Z, LAYOUTS, SHOTS, Layout, camera_yaml, rows, shoot
 
 from splatam_core.cli import main
-from splatam_core.datasets import icl, open_sequence, replica, replica_v2
+from splatam_core.datasets import icl, replica, replica_v2
 from splatam_core.datasets.base import FIRST_STAMP_NS
-from splatam_core.datasets.registry import READERS, _reader
+from splatam_core.datasets.registry import READERS, _reader, open_sequence
 from splatam_core.errors import CameraError, DatasetError
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera

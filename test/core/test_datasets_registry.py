@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatam_core.datasets import BagTopics, open_sequence
-from splatam_core.datasets.base import Window, cut, nominal_stamp_ns
-from splatam_core.datasets.registry import READERS
+from splatam_core.datasets.base import BagTopics, Window, cut, nominal_stamp_ns
+from splatam_core.datasets.registry import READERS, open_sequence
 from splatam_core.errors import CameraError, DatasetError
 
 

@@ -10,7 +10,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from msg_adapters import camera_info, images, poses
 from msg_adapters.factory import RosbagsMessages
-from splatam_core.datasets import BagTopics, open_sequence, write_bag
+from splatam_core.datasets.base import BagTopics
+from splatam_core.datasets.convert import write_bag
+from splatam_core.datasets.registry import open_sequence
 from splatam_core.errors import CameraError, DatasetError, FrameError
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.trajectory import Trajectory

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from splatam_core.config import load_config
-from splatam_core.datasets import open_sequence
+from splatam_core.datasets.registry import open_sequence
 from splatam_core.evaluation.trajectory import trajectory_error
 from splatam_core.geometry.trajectory import Trajectory
 from splatam_core.slam import Slam

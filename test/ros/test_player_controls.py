@@ -59,7 +59,7 @@ def test_services_pause_step_and_resume(graph: Graph, bag: Path) -> None:
     received = subscribe(graph)
     player = graph.play(str(bag), '--topics', RGB, '--start-paused')
     remote = Remote(graph, player)
-    player.wait_says('paused (~/resume goes on)')
+    player.wait_says('paused (the service ~/resume resumes)')
     assert remote.trigger('is_paused') == (True, 'paused')
     assert stays(graph, lambda: len(received[RGB])) and received[RGB] == []
     for count in (1, 2):
@@ -118,7 +118,7 @@ def test_keys_pause_step_and_change_the_rate(graph: Graph, bag: Path, terminal: 
     user, stdin = terminal
     received = subscribe(graph)
     player = graph.play(str(bag), '--topics', RGB, '--start-paused', stdin=stdin)
-    player.wait_says('paused (space goes on, cursor right plays one message)')
+    player.wait_says('paused (space resumes, cursor right plays one message)')
     os.write(user, b'\x1b[C\x1bOC')  # terminals send cursor keys in two ways
     graph.spin_until(lambda: len(received[RGB]) == 2, explain=lambda: player.text)
     os.write(user, b'\x1b')  # slow lines deliver a key in pieces

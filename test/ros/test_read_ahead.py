@@ -8,9 +8,9 @@ from collections.abc import Iterator
 
 import pytest
 
+from splatam_core.datasets.bag.recording import RawMessage
 from splatam_core.errors import DatasetError
 from splatam_ros.player.read_ahead import ReadAhead
-from splatam_ros.player.recording import RawMessage
 
 TIMEOUT_S = 10.0  # only ever waited out when a test fails
 

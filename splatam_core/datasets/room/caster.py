@@ -1,7 +1,7 @@
-"""The synthetic room: paint and light put together, and the ray caster that looks at it.
+"""Combines paint and light into the synthetic room, and renders it by ray casting.
 
-All paint lies in one image, the atlas, with the light already in it: the lamps do not move, so shadows
-are computed once per room. A view then costs one intersection per ray and surface in sight, and one
+The paint of all surfaces lies in one image, the atlas, already multiplied by the light: lamps do not move, so shadows
+are computed once per room. Rendering a view takes one intersection per ray and visible surface, and one
 look-up in the atlas per ray.
 """
 
@@ -24,12 +24,12 @@ ATLAS_WIDTH = 4096
 
 @dataclass(frozen=True, eq=False)
 class Cast:
-    """What each ray of a view meets.
+    """What each ray of a view hits.
 
     Attributes:
         depth_m: [H, W] float32 along the optical axis.
         surface: [H, W] int16, index of the surface.
-        atlas_x, atlas_y: [H, W] float32, where its paint is.
+        atlas_x, atlas_y: [H, W] float32, position of its paint in the atlas.
     """
 
     depth_m: Image
@@ -56,7 +56,7 @@ class Room:
             self._put(place, surface.paint(rng, height, width) * lightness[..., None])
 
     def incidence(self, camera: PinholeCamera, T_world_cam: Array, cast: Cast) -> Image:
-        """Cosine between each ray and the surface it meets, [H, W]; 1 = head on."""
+        """Returns the cosine of the angle between each ray and the normal of the surface it hits, [H, W]."""
         view = View(camera, T_world_cam)
         cosine = np.ones_like(cast.depth_m)
         for index in np.unique(cast.surface):
@@ -64,7 +64,7 @@ class Room:
         return cosine
 
     def cast(self, camera: PinholeCamera, T_world_cam: Array) -> Cast:
-        """Follow one ray through each pixel's centre."""
+        """Cast one ray through the centre of each pixel."""
         shape = (camera.height, camera.width)
         nearest = Cast(np.full(shape, np.inf, np.float32), np.zeros(shape, np.int16), *np.zeros((2, *shape), np.float32))
         view = View(camera, T_world_cam)
@@ -75,15 +75,15 @@ class Room:
         return nearest
 
     def color(self, camera: PinholeCamera, T_world_cam: Array) -> NDArray[np.uint8]:
-        """The view as an image [H, W, 3], four rays to a pixel."""
+        """Render the view as an image [H, W, 3], with four rays per pixel."""
         fine = self.cast(camera.resized(2 * camera.width, 2 * camera.height), T_world_cam)
         colors = cv2.remap(self._atlas, fine.atlas_x, fine.atlas_y, cv2.INTER_LINEAR)
-        return cv2.resize(colors, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        return np.asarray(cv2.resize(colors, (camera.width, camera.height), interpolation=cv2.INTER_AREA), np.uint8)
 
     def _put(self, place: tuple[int, int], lit: Image) -> None:
-        """Into the atlas, with a margin of one texel, for bilinear look-ups reach over the edge."""
+        """Write paint into the atlas, with a margin of one texel because bilinear look-ups reach over the edge."""
         (x, y), (height, width) = place, lit.shape[:2]
-        margined = cv2.copyMakeBorder(lit, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+        margined = np.asarray(cv2.copyMakeBorder(lit, 1, 1, 1, 1, cv2.BORDER_REPLICATE), np.float32)
         self._atlas[y - 1 : y + height + 1, x - 1 : x + width + 1] = _display(margined)
 
     def _keep_nearest(self, nearest: Cast, index: int, region: Region, hits: Hits) -> None:
@@ -98,18 +98,18 @@ class Room:
 
 @lru_cache(maxsize=2)
 def build_room(seed: int) -> Room:
-    """The room of a seed; building one takes a second or two, so the last two are kept."""
+    """Returns the room of a seed. Building one takes a second or two, so the last two are kept."""
     return Room(seed)
 
 
 def _display(light: Image) -> NDArray[np.uint8]:
-    """Linear light as 8-bit display values, bright light rolled off softly."""
+    """Convert linear light to 8-bit display values, with a soft roll-off in bright areas."""
     exposed = 1 - np.exp(-1.7 * light)
     return np.rint(255 * exposed ** (1 / 1.5)).astype(np.uint8)
 
 
 def _pack(sizes: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Places for rectangles on shelves of the atlas, with a margin of one texel around each."""
+    """Returns a position in the atlas for each rectangle (width, height): in rows, with a margin of one texel."""
     places = [(0, 0)] * len(sizes)
     x = y = shelf = 0
     for index in sorted(range(len(sizes)), key=lambda index: -sizes[index][1]):

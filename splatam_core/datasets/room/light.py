@@ -1,4 +1,4 @@
-"""Light that stands still: what falls on each texel of a room, soft shadows included, computed once."""
+"""The room's static lighting: the light on each texel of its surfaces, with soft shadows, computed once."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from splatam_core.datasets.room.furniture import ROOM_SIZE_M
 from splatam_core.datasets.room.surfaces import Array, Box, Image, Sphere, Surface
 
 LUMEL_M = 0.08
-"""Spacing of the points where light is computed; in between it is interpolated."""
+"""Spacing of the points at which light is computed; between them it is interpolated."""
 
 
 class Light:
@@ -28,19 +28,22 @@ class Light:
         self._window = [np.array([-x / 2 + 0.02, -0.15 + 0.6 * a, 1.45 + 0.45 * b]) for a in side for b in side]
 
     def on(self, surfaces: list[Surface]) -> list[Image]:
-        """Light on each texel of each surface, [h, w] each."""
+        """Compute the light on each texel of each surface, [h, w] each."""
         grids = [_lumels(surface) for surface in surfaces]
         counts = np.cumsum([u.size for u, _ in grids])[:-1]
         pairs = [surface.points(u.ravel(), v.ravel()) for surface, (u, v) in zip(surfaces, grids)]
         points, normals = (np.concatenate(side).T.astype(np.float32) for side in zip(*pairs))
         light = self.AMBIENT * (1 + 0.2 * normals[2])
-        light += self._from(self._lamp, np.float32([0, 0, -1]), self.LAMP, points, normals)
-        light += self._from(self._window, np.float32([1, 0, 0]), self.DAYLIGHT, points, normals)
+        light += self._from(self._lamp, np.array([0, 0, -1], np.float32), self.LAMP, points, normals)
+        light += self._from(self._window, np.array([1, 0, 0], np.float32), self.DAYLIGHT, points, normals)
         parts = np.split(light.astype(np.float32), counts)
-        return [cv2.resize(part.reshape(u.shape), surface.size_texels) for part, (u, _), surface in zip(parts, grids, surfaces)]
+        return [
+            np.asarray(cv2.resize(part.reshape(u.shape), surface.size_texels), np.float32)
+            for part, (u, _), surface in zip(parts, grids, surfaces)
+        ]
 
     def _from(self, sources: list[Array], facing: Image, power: float, points: Image, normals: Image) -> Image:
-        """Lambertian light from an area light, sampled at a few sources, on [3, N] points."""
+        """Compute the Lambertian light of an area light, sampled at a few sources, on [3, N] points."""
         total = np.zeros(points.shape[1], np.float32)
         raised = points + np.float32(2e-3) * normals
         for source in sources:
@@ -50,7 +53,7 @@ class Light:
             lit = np.flatnonzero(gain > 0)
             lit = lit[~self._shaded(raised[:, lit], ray[:, lit])]
             total[lit] += gain[lit] / (np.float32(0.3) + squared[lit])
-        return power * total / len(sources)
+        return np.asarray(power * total / len(sources), np.float32)
 
     def _shaded(self, points: Image, rays: Image) -> NDArray[np.bool_]:
         shaded = np.zeros(points.shape[1], bool)
@@ -60,7 +63,7 @@ class Light:
 
 
 def _lumels(surface: Surface) -> tuple[Array, Array]:
-    """Fractions u, v of a surface's sides where its light is computed, [rows, columns] each."""
+    """Returns the fractions u, v of a surface's sides at which its light is computed, [rows, columns] each."""
     columns, rows = (max(int(size * surface.texel_m / LUMEL_M), 2) for size in surface.size_texels)
     u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
     return u, v

@@ -6,6 +6,8 @@ at any distance. The generator alone decides the result.
 
 from __future__ import annotations
 
+from functools import reduce
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +15,13 @@ from numpy.typing import NDArray
 Paint = NDArray[np.float32]
 Color = tuple[float, float, float]
 
-PIGMENTS = np.float32(
+PIGMENTS = np.array(
     [
         (0.78, 0.62, 0.36), (0.62, 0.24, 0.16), (0.17, 0.26, 0.4), (0.86, 0.82, 0.7),
         (0.24, 0.38, 0.3), (0.5, 0.5, 0.48), (0.1, 0.1, 0.12), (0.84, 0.48, 0.2),
         (0.36, 0.55, 0.66), (0.45, 0.3, 0.2), (0.7, 0.68, 0.3), (0.55, 0.2, 0.3),
-    ]
+    ],
+    np.float32,
 )  # fmt: skip
 """What covers, spines and pictures are printed with."""
 
@@ -52,7 +55,7 @@ def pigment(rng: np.random.Generator) -> Color:
 
 def tinted(base: Color, *shades: Paint) -> Paint:
     """A base colour made lighter and darker by the sum of some [h, w] shades."""
-    return np.clip(np.float32(base) * (1 + sum(shades)[..., None]), 0, 1).astype(np.float32)
+    return np.clip(_rgb(base) * (1 + reduce(np.add, shades)[..., None]), 0, 1).astype(np.float32)
 
 
 def plaster(rng: np.random.Generator, height: int, width: int, base: Color = (0.8, 0.78, 0.72)) -> Paint:
@@ -73,8 +76,8 @@ def wallpaper(rng: np.random.Generator, height: int, width: int, base: Color, mo
     radius, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
     flower = radius < 11 + 6 * np.cos(5 * angle)
     stripe = np.abs(dx) < 2
-    paint[flower | stripe] = paint[flower | stripe] * 0.35 + np.float32(motif) * 0.65
-    paint[radius < 4] = np.float32(base) * 0.5
+    paint[flower | stripe] = paint[flower | stripe] * 0.35 + _rgb(motif) * 0.65
+    paint[radius < 4] = _rgb(base) * 0.5
     return paint
 
 
@@ -104,10 +107,10 @@ def wood(rng: np.random.Generator, height: int, width: int, base: Color = (0.62,
 def fabric(rng: np.random.Generator, height: int, width: int, base: Color, accent: Color) -> Paint:
     """A woven tartan with fluff."""
     y, x = np.mgrid[:height, :width]
-    paint = np.broadcast_to(np.float32(base), (height, width, 3)).copy()
+    paint = np.broadcast_to(_rgb(base), (height, width, 3)).copy()
     for axis in (x, y):
         wide, thin = axis % 80 < 26, axis % 80 // 4 == 14
-        paint[wide] = paint[wide] * 0.6 + np.float32(accent) * 0.4
+        paint[wide] = paint[wide] * 0.6 + _rgb(accent) * 0.4
         paint[thin] = paint[thin] * 0.4 + np.float32(0.6)
     weave = np.where((x // 2 + y // 2) % 2, np.float32(0.05), np.float32(-0.05))
     shade = 1 + weave + 0.09 * noise(rng, height, width, coarsest=64, gain=0.8)
@@ -116,7 +119,7 @@ def fabric(rng: np.random.Generator, height: int, width: int, base: Color, accen
 
 def rug(rng: np.random.Generator, height: int, width: int) -> Paint:
     """A carpet: framed borders around a field of diamonds."""
-    palette = np.float32([(0.52, 0.1, 0.12), (0.82, 0.68, 0.42), (0.1, 0.16, 0.34), (0.25, 0.42, 0.36), (0.7, 0.35, 0.2)])
+    palette = np.array([(0.52, 0.1, 0.12), (0.82, 0.68, 0.42), (0.1, 0.16, 0.34), (0.25, 0.42, 0.36), (0.7, 0.35, 0.2)], np.float32)
     y, x = np.mgrid[:height, :width].astype(np.float32)
     edge = np.minimum(np.minimum(x, width - 1 - x), np.minimum(y, height - 1 - y))
     diamond = np.abs(x % 90 - 45) + np.abs(y % 90 - 45)
@@ -173,11 +176,11 @@ def window(rng: np.random.Generator, height: int, width: int) -> Paint:
     """A window onto sky, hills and trees, with white bars."""
     y = np.linspace(0, 1, height, dtype=np.float32)[:, None]
     clouds = np.clip(noise(rng, height, width, coarsest=128, gain=0.55), 0, 2)[..., None]
-    paint = np.float32([0.55, 0.72, 0.92]) + y[..., None] * 0.25 + 0.12 * clouds * np.float32([1, 1, 0.8])
+    paint = _rgb((0.55, 0.72, 0.92)) + y[..., None] * 0.25 + 0.12 * clouds * _rgb((1, 1, 0.8))
     for horizon, color in ((0.55, (0.45, 0.55, 0.6)), (0.7, (0.3, 0.45, 0.25)), (0.85, (0.18, 0.3, 0.12))):
         ridge = horizon + 0.06 * noise(rng, 1, width, coarsest=128, gain=0.5)
         foliage = 1 + 0.22 * noise(rng, height, width, coarsest=16, gain=0.9)[..., None]
-        paint = np.where((y > ridge)[..., None], np.float32(color) * foliage, paint)
+        paint = np.where((y > ridge)[..., None], _rgb(color) * foliage, paint)
     for x in (width // 2, width // 2 + 1):
         paint[:, x - 5 : x + 5] = 0.92
     paint[height // 2 - 5 : height // 2 + 5] = 0.9
@@ -199,7 +202,7 @@ def cardboard(rng: np.random.Generator, height: int, width: int, base: Color = (
     flutes = 0.04 * np.sin(np.arange(width, dtype=np.float32) * 1.3)[None, :]
     paint = tinted(base, flutes, 0.07 * noise(rng, height, width, coarsest=64, gain=0.8))
     band = slice(int(height * 0.44), int(height * 0.56))
-    paint[band] = paint[band] * 0.6 + np.float32([0.8, 0.7, 0.5]) * 0.4
+    paint[band] = paint[band] * 0.6 + _rgb((0.8, 0.7, 0.5)) * 0.4
     top, left = int(height * 0.12), int(width * rng.uniform(0.08, 0.4))
     label = paint[top : top + int(height * 0.26), left : left + int(width * 0.4)]
     label[:] = 0.92
@@ -225,9 +228,14 @@ def marbled(rng: np.random.Generator, height: int, width: int, a: Color, b: Colo
     """Two colours in veins and continents."""
     land = np.tanh(3 * noise(rng, height, width, coarsest=64, gain=0.6))[..., None] * 0.5 + 0.5
     veins = noise(rng, height, width, coarsest=16, gain=0.9)[..., None]
-    return np.clip((np.float32(a) * land + np.float32(b) * (1 - land)) * (1 + 0.12 * veins), 0, 1)
+    return np.clip((_rgb(a) * land + _rgb(b) * (1 - land)) * (1 + 0.12 * veins), 0, 1)
 
 
 def _frame(paint: Paint, thickness: int, color: Color) -> None:
     for edge in (paint[:thickness], paint[-thickness:], paint[:, :thickness], paint[:, -thickness:]):
         edge[:] = color
+
+
+def _rgb(color: Color) -> Paint:
+    """A colour as an array, [3] float32."""
+    return np.array(color, np.float32)

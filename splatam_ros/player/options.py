@@ -1,4 +1,4 @@
-"""How to play: what the command line asks for, of this recording."""
+"""How to play a recording: the command line, resolved against what the recording holds."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
+from splatam_core.datasets.bag.recording import Recording
 from splatam_ros.player.offered_qos import Policies, read_overrides
-from splatam_ros.player.recording import Recording
+from splatam_ros.player.playable import PlayableTopics
 from splatam_ros.process import RosError
 
-ANSWERS = ('/splatam/pose', '/splatam/processed')
+ANSWER_TOPICS = ('/splatam/pose', '/splatam/processed')
+"""Where ``splatam_node`` answers frames: those that get a pose, and those that get none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,23 +23,24 @@ class Options:
     Attributes:
         topics: names of the topics to play, as recorded.
         remap: from recorded names to names on the graph.
-        qos: by recorded name, what the user says about the QoS.
-        must_arrive: offer reliability where best effort was recorded.
-        start_ns: recording time of the beginning.
-        end_ns: recording time of the end, inclusive.
-        rate: recording seconds in a wall second; None = as fast as the listeners allow.
+        qos: by recorded name, the QoS policies that the user sets.
+        must_arrive: True to offer reliability even if best effort was recorded.
+        start_ns: recording time at which to start.
+        end_ns: recording time at which to stop, inclusive.
+        rate: recording seconds per wall second; None = as fast as the listeners allow.
         delay_s: wall time before the first message, in every loop.
-        loop: start over at the end.
-        clock_hz: how often to publish ``/clock``; None = not periodically.
+        loop: True to start over at the end.
+        clock_hz: rate at which to publish ``/clock``; None = not periodically.
         clock_topics: recorded topics before whose messages ``/clock`` is published.
-        start_paused: wait for a key or a service before the first message.
-        read_ahead: most messages to read before they are due.
-        wait_for: the topics that answer frames: the first must come up, the others may. Empty = the transport.
-        max_ahead: frames handed out beyond the newest answer.
+        start_paused: True to wait for a key or a service before the first message.
+        read_ahead: largest number of messages to read before they are due.
+        wait_for: topics that answer frames. The first must exist, the others need not. Empty = the transport's
+            acknowledgements answer.
+        max_ahead: number of frames that may be published beyond the newest answer.
         wait_timeout_s: longest wait for an answer.
-        acknowledge_timeout_s: longest wait, at the end, until subscribers have everything.
-        wait_for_subscribers: wait until the images are subscribed to, and stop when they no longer are.
-        discovery_timeout_s: longest wait for subscribers and for the answering topic.
+        acknowledge_timeout_s: longest wait, at the end, until subscribers have received everything.
+        wait_for_subscribers: True to wait until the images have subscribers, and to stop when these leave.
+        discovery_timeout_s: longest wait for subscribers and for the answer topic.
     """
 
     topics: tuple[str, ...]
@@ -61,19 +64,24 @@ class Options:
     discovery_timeout_s: float
 
 
-def make_options(args: argparse.Namespace, recording: Recording) -> Options:
-    """What the command line asks for, of this recording.
+def make_options(args: argparse.Namespace, recording: Recording, playable: PlayableTopics) -> Options:
+    """Resolve the command line against a recording.
+
+    Args:
+        args: from the parser in ``main``.
+        recording: what to play.
+        playable: its topics that can be published.
 
     Raises:
-        RosError: a topic is not in it, nothing is left to play, or the QoS file cannot be used.
+        RosError: a named topic is not in the recording, nothing is left to play, or the QoS file cannot be used.
     """
     remap = dict(args.remap)
     qos = read_overrides(args.qos_profile_overrides_path) if args.qos_profile_overrides_path else {}
     named = [*(args.topics or []), *args.exclude_topics, *args.clock_topics, *remap, *qos]
     _require_known(named, recording)
-    topics = _choose_topics(args, recording)
+    topics = _choose_topics(args, recording, playable)
     start_ns, end_ns = _cut(args, recording)
-    wait_for = ANSWERS if args.wait_for == ANSWERS[0] else (args.wait_for,) if args.wait_for else ()
+    wait_for = ANSWER_TOPICS if args.wait_for == ANSWER_TOPICS[0] else (args.wait_for,) if args.wait_for else ()
     return Options(
         topics=topics,
         remap=remap,
@@ -98,25 +106,24 @@ def make_options(args: argparse.Namespace, recording: Recording) -> Options:
 
 
 def _require_known(names: Iterable[str], recording: Recording) -> None:
-    known = {**recording.topics, **recording.skipped}
     for name in names:
-        if name not in known:
-            raise RosError(f'{name} is not in {recording.path}, which holds {", ".join(sorted(known))}')
+        if name not in recording.topics:
+            raise RosError(f'{name} is not in {recording.path}, which holds {", ".join(sorted(recording.topics))}')
 
 
-def _choose_topics(args: argparse.Namespace, recording: Recording) -> tuple[str, ...]:
-    """Named or matching ones, all where neither is asked for; without those to leave out and without a second clock."""
+def _choose_topics(args: argparse.Namespace, recording: Recording, playable: PlayableTopics) -> tuple[str, ...]:
+    """Choose the named and matching topics, or all; leave out the excluded ones, and a recorded clock if one is published."""
     makes_clock = args.clock or args.clock_topics or args.clock_topics_all
     excluded = {*args.exclude_topics, *(['/clock'] if makes_clock else [])}
     chosen = tuple(
         name
-        for name in recording.topics
+        for name in playable.topics
         if _is_asked_for(name, args.topics, args.regex)
         and name not in excluded
         and not (args.exclude_regex and args.exclude_regex.search(name))
     )
     if not chosen:
-        raise RosError(f'{recording.path}: no topic is left to play of {", ".join(sorted(recording.topics)) or "none"}')
+        raise RosError(f'{recording.path}: no topic is left to play of {", ".join(sorted(playable.topics)) or "none"}')
     return chosen
 
 
@@ -127,7 +134,7 @@ def _is_asked_for(name: str, topics: Collection[str] | None, regex: re.Pattern[s
 
 
 def _cut(args: argparse.Namespace, recording: Recording) -> tuple[int, int]:
-    """Recording time of beginning and end."""
+    """Returns the recording times of start and end."""
     if args.start_offset > recording.duration_s:
         raise RosError(f'--start-offset {args.start_offset:g}: the recording lasts {recording.duration_s:.1f} s')
     start_ns = recording.start_ns + round(args.start_offset * 1e9)
