@@ -2,7 +2,7 @@
 
     python benchmarks/camera.py BAG LOG [--rate 30] [--frames N] [--now]
 
-``splatam convert`` wrote BAG, which is read into memory before the first frame. Publishing starts when every topic has a subscriber.
+``splatam convert`` wrote BAG. It is read into memory first; publishing starts when every topic has a subscriber.
 LOG gets a line for each frame: its stamp, and the wall time at which the later of its two images was handed to ROS, in nanoseconds.
 """
 

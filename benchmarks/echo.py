@@ -1,4 +1,4 @@
-"""The least that a node can do with a camera's images: a pose for each pair, undecoded. See ``node_overhead.py``."""
+"""A minimal node for comparison: it publishes a pose for each pair of images without decoding them. See ``node_overhead.py``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from splatam_ros.process import StopRequest, ros
 
 
 class Echo(Node):
-    """Subscribes to what the SLAM node subscribes to."""
+    """Subscribes to the topics of the SLAM node."""
 
     def __init__(self, topic: str) -> None:
         super().__init__('echo')
@@ -33,7 +33,7 @@ class Echo(Node):
 
 
 def main() -> None:
-    """Answer on the topic named on the command line until stopped."""
+    """Publish on the topic named on the command line until stopped."""
     with StopRequest() as stop, ros(()):
         node = Echo(sys.argv[1])
         executor = SingleThreadedExecutor()

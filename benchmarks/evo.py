@@ -3,9 +3,9 @@
     python -m venv evo-venv && evo-venv/bin/pip install evo
     python benchmarks/evo.py RUN --evo evo-venv/bin
 
-evo reads two TUM trajectories, both written here: the estimate, and the truth interpolated at its stamps, so that
-alignment and statistics are compared and not how stamps are matched. RUN is a folder whose source has true poses,
-every frame tracked.
+evo reads two TUM trajectories that this script writes: the estimate, and the ground truth interpolated at its stamps. The
+comparison is therefore about alignment and statistics, not about matching stamps. RUN is a run folder whose source has a
+ground truth and in which every frame was tracked.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import re
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -28,14 +29,21 @@ COLUMNS = '| | ours | evo | difference |'
 
 
 def rmse(evo: Path, program: str, truth: Path, estimate: Path, *options: str) -> float:
-    """What evo prints as RMSE."""
+    """Returns the RMSE that evo prints.
+
+    Raises:
+        SystemExit: evo printed none.
+    """
     command = [str(evo / program), 'tum', str(truth), str(estimate), *options]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
-    return float(re.search(r'rmse\s+([0-9.eE+-]+)', done.stdout)[1])
+    found = re.search(r'rmse\s+([0-9.eE+-]+)', done.stdout)
+    if found is None:
+        sys.exit(f'{program} printed no rmse:\n{done.stdout}')
+    return float(found[1])
 
 
 def write(path: Path, trajectory: Trajectory) -> Path:
-    """A trajectory in the TUM format."""
+    """Write a trajectory in the TUM format. Returns the path."""
     path.write_text('\n'.join(map(pose_line, trajectory.stamps_ns.tolist(), trajectory.T_world_cam)) + '\n')
     return path
 
@@ -47,7 +55,10 @@ def main() -> None:
     parser.add_argument('--evo', type=Path, required=True, metavar='DIR', help='folder of evo_ape and evo_rpe')
     args = parser.parse_args()
     run = read_run(args.run)
-    truth = open_source(run.description.source).ground_truth()
+    source = run.description.source
+    truth = None if source is None else open_source(source).ground_truth()
+    if truth is None:
+        parser.error(f'{args.run}: its recording has no ground truth')
     ours = score_trajectory(run, truth)
     poses, known = interpolate_poses(truth, run.trajectory.stamps_ns)
     stamps_ns = run.trajectory.stamps_ns[known]
@@ -61,10 +72,10 @@ def main() -> None:
         second = '--delta', str(frames_a_second), '--delta_unit', 'f', '--all_pairs'
         rows = [
             ('ATE RMSE, m', ours.error.rmse_m, ('evo_ape', '--align')),
-            ('RPE a frame, m', ours.per_frame.translation_rmse_m, ('evo_rpe', *step)),
-            ('RPE a frame, deg', ours.per_frame.rotation_rmse_deg, ('evo_rpe', *step, '-r', 'angle_deg')),
-            ('RPE a second, m', ours.per_second.translation_rmse_m, ('evo_rpe', *second)),
-            ('RPE a second, deg', ours.per_second.rotation_rmse_deg, ('evo_rpe', *second, '-r', 'angle_deg')),
+            ('RPE per frame, m', ours.per_frame.translation_rmse_m, ('evo_rpe', *step)),
+            ('RPE per frame, deg', ours.per_frame.rotation_rmse_deg, ('evo_rpe', *step, '-r', 'angle_deg')),
+            ('RPE per second, m', ours.per_second.translation_rmse_m, ('evo_rpe', *second)),
+            ('RPE per second, deg', ours.per_second.rotation_rmse_deg, ('evo_rpe', *second, '-r', 'angle_deg')),
         ]
         print_header(f'{len(stamps_ns)} poses of {args.run.name} against evo', 1)
         print(f'{COLUMNS}\n|---|---|---|---|')

@@ -1,15 +1,16 @@
-"""The GPU: times against gsplat and the reference, frames per second, agreement with the CPU, and a profile of one frame.
+"""GPU benchmarks: times beside gsplat and the reference, frames per second, agreement with the CPU, profile of one frame.
 
     python benchmarks/gpu.py [SOURCE] [--width W] [--only kernels,frames,agreement,profile]
 
-SOURCE is a recording, of which at most 100 frames are read, before any clock starts; without one it is the synthetic room. gsplat
-is compared where it is installed (pip install gsplat). ``--device cpu`` tries this script out on a machine without a GPU: tiny
-sizes, through Triton's interpreter, whose times mean nothing.
+SOURCE is a recording (default: the synthetic room). At most 100 frames of it are read, before any clock starts. gsplat is
+compared if it is installed (pip install gsplat). ``--device cpu`` tests this script on a machine without a GPU, with tiny
+sizes and Triton's interpreter; its times mean nothing.
 
-kernels: Gaussians of one pixel's width, opacity one half, spread at random over the view between 1 and 3 m. Forward is everything
-from the parameters to the images; backward ends at the parameters' gradients (map) or at the pose's alone (pose).
-frames: presets ``splatam`` and ``realtime`` over the recording.
-agreement: poses from the same state, GPU beside CPU; then each running freely, and the CPU with another seed.
+kernels: Gaussians one pixel wide, opacity 0.5, at random over the view at a depth of 1 to 3 m. Forward covers everything from
+the parameters to the images; backward ends at the gradients of the parameters (map) or of the pose alone (pose).
+frames: presets ``splatam`` and ``realtime`` on the recording.
+agreement: poses of GPU and CPU from the same state; then free runs of both, and of the CPU with another seed.
+profile: the operations of one frame by device time.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from splatam_core.types import RgbdFrame, Status
 
 MAX_FRAMES = 100
 PARTS = ('kernels', 'frames', 'agreement', 'profile')
-REFERENCE_SCENE = (64, 48, 3000)  # pixels, Gaussians: every pair of them is held at once
+REFERENCE_SCENE = (64, 48, 3000)  # width, height, Gaussians; the reference holds every pair of pixel and Gaussian in memory
 
 Draw = Callable[[Gaussians, Tensor], list[Tensor]]  # from Gaussians and a pose [4, 4] to images
 
@@ -50,13 +51,13 @@ class Plan:
     """What to run, and where.
 
     Attributes:
-        device: ``cuda``, or ``cpu`` to try the script.
-        rasterizer: of the SLAM runs.
-        sizes: of the images in the kernels' table.
-        counts: of Gaussians there.
-        runs: timed, of each line of it.
-        frames: of the recording.
-        settings: of the SLAM runs, on top of the presets.
+        device: ``cuda``, or ``cpu`` to test the script.
+        rasterizer: rasterizer of the SLAM runs.
+        sizes: image sizes in the table of kernels.
+        counts: numbers of Gaussians in that table.
+        runs: number of timed runs for each of its lines.
+        frames: number of frames of the recording.
+        settings: ``name=value`` settings of the SLAM runs, applied after the preset.
     """
 
     device: str
@@ -83,7 +84,7 @@ def finish() -> None:
 
 
 def median_ms(function: Callable[[], object], runs: int) -> float:
-    """Of so many runs after three that do not count: compilation, room for lists, allocation."""
+    """Returns the median time of ``runs`` runs, after three that compile kernels and allocate memory."""
     times = []
     for _ in range(3 + runs):
         finish()
@@ -95,7 +96,7 @@ def median_ms(function: Callable[[], object], runs: int) -> float:
 
 
 def scene(cam: PinholeCamera, count: int, device: str) -> Gaussians:
-    """At random over the view and a little beyond it."""
+    """Returns Gaussians at random positions in the view and slightly beyond it."""
     generator = torch.Generator().manual_seed(0)
     u, v, noise = torch.rand(3, count, generator=generator)
     u, v = (1.1 * u - 0.05) * cam.width, (1.1 * v - 0.05) * cam.height
@@ -106,7 +107,7 @@ def scene(cam: PinholeCamera, count: int, device: str) -> Gaussians:
 
 
 def ours(name: str, cam: PinholeCamera) -> Draw:
-    """A backend of this project."""
+    """Returns the drawing function of one of this project's rasterizers."""
     rasterizer = make_rasterizer(name)
 
     def draw(gaussians: Gaussians, pose: Tensor) -> list[Tensor]:
@@ -117,12 +118,15 @@ def ours(name: str, cam: PinholeCamera) -> Draw:
 
 
 def gsplat(cam: PinholeCamera) -> Draw | None:
-    """The same images by gsplat; None where it is not installed. It knows no isotropic Gaussians: three radii, and a rotation."""
+    """Returns the drawing function of gsplat, or None if it is not installed.
+
+    gsplat has no isotropic Gaussians, so it is given three radii and a rotation.
+    """
     try:
         from gsplat import rasterization
     except ImportError:
         return None
-    # Its pixels begin at their corners.
+    # In gsplat a pixel centre is at +0.5.
     K = torch.tensor([[cam.fx, 0, cam.cx + 0.5], [0, cam.fy, cam.cy + 0.5], [0, 0, 1]], device='cuda')
 
     def draw(gaussians: Gaussians, pose: Tensor) -> list[Tensor]:
@@ -137,7 +141,7 @@ def gsplat(cam: PinholeCamera) -> Draw | None:
 
 
 def kernel_row(name: str, draw: Draw, cam: PinholeCamera, still: Gaussians, runs: int) -> None:
-    """One line of the table."""
+    """Print a line of the table."""
     pose = torch.eye(4, device=still.means.device)
     pose[0, 3] = 0.003
     moving = with_gradients(still)
@@ -152,18 +156,18 @@ def kernel_row(name: str, draw: Draw, cam: PinholeCamera, still: Gaussians, runs
 
 
 def forth_and_back(draw: Draw, gaussians: Gaussians, pose: Tensor) -> None:
-    """From the parameters to images, and from gradients of one in all of these to the parameters that want some."""
+    """Run forward and backward passes, with a gradient of one for every value of every image."""
     images = draw(gaussians, pose)
     torch.autograd.backward(images, [torch.ones_like(image) for image in images])
 
 
 def peak_mb() -> str:
-    """Device memory since the last reset."""
+    """Returns the peak of device memory since the last reset, in MiB."""
     return f'{torch.cuda.max_memory_allocated() / 2**20:.0f}' if torch.cuda.is_available() else '–'
 
 
 def print_kernels(plan: Plan) -> None:
-    """(a): the rasterizers' times."""
+    """Part ``kernels``: times of the rasterizers."""
     print('| backend | image | Gaussians | forward ms | forward + backward, map ms | forward + backward, pose ms | peak MB |')
     print('|---|---|---|---|---|---|---|')
     for width, height in plan.sizes:
@@ -184,25 +188,25 @@ def print_kernels(plan: Plan) -> None:
 
 
 def slam_of(plan: Plan, preset: str) -> Slam:
-    """A fresh one on the plan's device."""
+    """Returns a new Slam on the plan's device."""
     return Slam(load_config(preset, [*plan.settings, f'device={plan.device}', f'rasterizer={plan.rasterizer}']))
 
 
 def host_slam(plan: Plan, preset: str, seed: int = 0) -> Slam:
-    """A fresh one on the CPU, by the native kernels."""
+    """Returns a new Slam on the CPU, with the native code."""
     return Slam(load_config(preset, [*plan.settings, f'seed={seed}', 'device=cpu', 'rasterizer=cpu']))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Run:
-    """A recording that was processed.
+    """The results of processing a recording.
 
     Attributes:
-        slam: with its map.
-        poses: those found; None = lost.
-        seconds: wall times of the frames.
-        finish_s: wall time in ``Slam.finish``.
-        rasterizer: its name.
+        slam: the Slam with its map.
+        poses: pose of each frame; None = lost.
+        seconds: wall time of each frame.
+        finish_s: wall time of ``Slam.finish``.
+        rasterizer: name of the rasterizer.
     """
 
     slam: Slam
@@ -212,7 +216,7 @@ class Run:
     rasterizer: str
 
     def psnr_db(self, frames: Sequence[RgbdFrame]) -> float:
-        """Of the final map at the poses found, over pixels with a depth reading."""
+        """Returns the mean PSNR of the final map at the estimated poses, over pixels with a depth reading."""
         scorer = ViewScorer(self.slam.map.gaussians, make_rasterizer(self.rasterizer), self.slam.config.depth)
         tracked = [(frame, pose) for frame, pose in zip(frames, self.poses) if pose is not None]
         scores = [scorer.score(frame, pose).scores.psnr_db for frame, pose in tracked]
@@ -220,7 +224,7 @@ class Run:
 
 
 def run(slam: Slam, frames: Sequence[RgbdFrame], rasterizer: str) -> Run:
-    """Process every frame, then finish; each time ends when the device is done."""
+    """Process every frame, then finish. Each time includes waiting for the device."""
     poses, seconds = [], []
     for frame in frames:
         start = time.perf_counter()
@@ -235,8 +239,8 @@ def run(slam: Slam, frames: Sequence[RgbdFrame], rasterizer: str) -> Run:
 
 
 def print_frames(plan: Plan, frames: Sequence[RgbdFrame]) -> None:
-    """(b): frames per second and memory of the presets. A first run compiles what there is to compile."""
-    print('| preset | image | frames | tracked | fps | ms a frame (median, p95) | Gaussians | peak MB |')
+    """Part ``frames``: frames per second and memory of the presets. A first run compiles the kernels."""
+    print('| preset | image | frames | tracked | fps | ms per frame (median, p95) | Gaussians | peak MB |')
     print('|---|---|---|---|---|---|---|---|')
     for preset in ('splatam', 'realtime'):
         run(slam_of(plan, preset), frames[:2], plan.rasterizer)
@@ -252,14 +256,14 @@ def print_frames(plan: Plan, frames: Sequence[RgbdFrame]) -> None:
 
 
 def apart_mm(one: Sequence[NDArray[np.float64] | None], other: Sequence[NDArray[np.float64] | None]) -> NDArray[np.float64]:
-    """How far apart two runs see the camera, frame by frame, where both track it."""
+    """Returns the distance between the camera positions of two runs, for each frame that both track, in millimetres."""
     return np.array([
         1e3 * float(np.linalg.norm(a[:3, 3] - b[:3, 3])) for a, b in zip(one, other) if a is not None and b is not None
     ])  # fmt: skip
 
 
 def print_same_state(plan: Plan, preset: str, frames: Sequence[RgbdFrame]) -> None:
-    """(c), first half: both process every frame from the state that the CPU has reached."""
+    """Part ``agreement``: GPU and CPU process every frame from the state that the CPU has reached."""
     host, there = host_slam(plan, preset), slam_of(plan, preset)
     here, poses = [], []
     for frame in frames:
@@ -273,12 +277,12 @@ def print_same_state(plan: Plan, preset: str, frames: Sequence[RgbdFrame]) -> No
     ]  # fmt: skip
     lost = sum((a is None) != (b is None) for a, b in zip(here, poses))
     print(f'From the same state ({preset}, {len(frames)} frames): poses differ by {apart.max():.4f} mm and {max(turned):.5f} '
-          f'degrees at most, median {np.median(apart):.4f} mm; limit 0.2 mm; {lost} frames tracked by one alone.\n',
+          f'degrees at most, median {np.median(apart):.4f} mm; limit 0.2 mm; {lost} frames tracked by only one of them.\n',
           flush=True)  # fmt: skip
 
 
 def print_free_running(plan: Plan, preset: str, frames: Sequence[RgbdFrame]) -> None:
-    """(c), second half: the GPU's run beside what another seed does to the CPU's."""
+    """Part ``agreement``: compares the difference between GPU and CPU with that between two seeds on the CPU."""
     cpu, other = (run(host_slam(plan, preset, seed), frames, 'cpu') for seed in (0, 1))
     there = run(slam_of(plan, preset), frames, plan.rasterizer)
     rms = [float(np.sqrt(np.mean(apart_mm(cpu.poses, run_.poses) ** 2))) for run_ in (there, other)]
@@ -286,11 +290,11 @@ def print_free_running(plan: Plan, preset: str, frames: Sequence[RgbdFrame]) -> 
     print(f'| {preset}, {len(frames)} frames, free-running | poses apart, mm RMS | PSNR dB |\n|---|---|---|')
     print(f'| CPU, seed 0 | 0 | {psnr[0]:.2f} |\n| CPU, seed 1 | {rms[1]:.3f} | {psnr[1]:.2f} |')
     print(f'| {plan.rasterizer} on {plan.device}, seed 0 | {rms[0]:.3f} | {psnr[2]:.2f} |')
-    print(f'\nLimits: {2 * rms[1]:.3f} mm (twice what the seeds differ by), and {psnr[0]:.2f} ± 0.1 dB.\n', flush=True)
+    print(f'\nLimits: {2 * rms[1]:.3f} mm (twice the difference between the seeds), and {psnr[0]:.2f} ± 0.1 dB.\n', flush=True)
 
 
 def print_profile(plan: Plan, preset: str, frames: Sequence[RgbdFrame]) -> None:
-    """(d): where the last frame's time goes."""
+    """Part ``profile``: prints the operations of the last frame by device time."""
     from torch.profiler import ProfilerActivity, profile
 
     slam = slam_of(plan, preset)
@@ -306,19 +310,19 @@ def print_profile(plan: Plan, preset: str, frames: Sequence[RgbdFrame]) -> None:
 
 
 def plan_or_exit(device: str) -> Plan:
-    """What can be run here; leaves with one line where there is no GPU."""
+    """Returns the plan for a device. Exits with one line if there is no GPU."""
     if device == 'cpu':
         os.environ['TRITON_INTERPRET'] = '1'  # before triton is imported
         return TRIAL
     if not torch.cuda.is_available():
-        sys.exit(f'benchmarks/gpu.py: torch {torch.__version__} finds no CUDA device; --device cpu tries the script without one')
+        sys.exit(f'benchmarks/gpu.py: torch {torch.__version__} finds no CUDA device; --device cpu tests the script without one')
     return GPU
 
 
 def print_device() -> None:
-    """What the header does not know."""
+    """Print GPU, CUDA and Triton versions."""
     if not torch.cuda.is_available():
-        print('No GPU: Triton is interpreted, the times below mean nothing.\n')
+        print('No GPU: Triton kernels are interpreted, so the times below mean nothing.\n')
         return
     import triton
 
@@ -328,12 +332,12 @@ def print_device() -> None:
 
 
 def main() -> None:
-    """Print what is asked for."""
+    """Print the chosen parts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('source', nargs='?', default='synthetic')
-    parser.add_argument('--width', type=int, help='of the frames; without it as recorded')
-    parser.add_argument('--preset', default='realtime', help='of agreement and profile')
-    parser.add_argument('--only', default=','.join(PARTS), help='parts, separated by commas')
+    parser.add_argument('--width', type=int, help='width of the frames (default: as recorded)')
+    parser.add_argument('--preset', default='realtime', help='preset of agreement and profile (default: %(default)s)')
+    parser.add_argument('--only', default=','.join(PARTS), help='parts to run, separated by commas (default: all)')
     parser.add_argument('--device', choices=('cuda', 'cpu'), default='cuda')
     arguments = parser.parse_args()
     plan = plan_or_exit(arguments.device)

@@ -1,9 +1,9 @@
-"""Does a frame cost more once the map is large? A long flight along a wall that always shows new surface.
+"""Does a frame take longer when the map is large? A long flight along a wall, where each frame shows new surface.
 
     python benchmarks/growth.py [--preset realtime] [--frames 2000] [--width 320] [--set KEY=VALUE]
 
-The wall, floor and ceiling are computed, not recorded, with sensor noise; the camera faces the wall at 75 degrees, sways
-and moves on by 2 cm a frame, about a hundredth of the view. Prints the cost per frame over windows of 100 frames, and the
+The images of wall, floor and ceiling are rendered, with sensor noise. The camera faces the wall at 75 degrees, sways, and
+moves by 2 cm per frame, about a hundredth of the view. Prints the time per frame over windows of 100 frames, and the
 ratio of the last window to the one at frame 200.
 """
 
@@ -31,13 +31,13 @@ RELIEF_M = 0.06
 
 
 def camera(width: int) -> PinholeCamera:
-    """Of about 63 degrees."""
+    """Returns a camera with a horizontal field of view of about 63 degrees."""
     focal = 525.0 * width / 640
     return PinholeCamera(width, width * 3 // 4, focal, focal, (width - 1) / 2, (width * 3 // 4 - 1) / 2)
 
 
 def pose(index: int) -> NDArray[np.float64]:
-    """[4, 4] camera to world: along z, turned towards the wall, swaying."""
+    """Returns the [4, 4] camera-to-world pose: motion along z, turned towards the wall, swaying."""
     T = np.eye(4)
     T[:3, 3] = 0.05 * np.sin(index / 17), 0.05 * np.sin(index / 11), STEP_M * index
     turn = se3.exp(np.array([0, 0, 0, 0.04 * np.sin(index / 13), FACING + 0.06 * np.sin(index / 23), 0.03 * np.sin(index / 9)]))
@@ -45,14 +45,14 @@ def pose(index: int) -> NDArray[np.float64]:
 
 
 def texture(along: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[..., 3] colours that never repeat: waves of incommensurate lengths, and tiles."""
+    """Returns [..., 3] colours that never repeat: tiles and waves of incommensurate lengths."""
     waves = [np.sin(a * along + b * across + c) for a, b, c in ((2.1, 1.3, 0), (5.7, -3.1, 1), (13.3, 8.9, 2), (0.37, 4.1, 3))]
     tiles = np.sign(np.sin(9.1 * along) * np.sin(7.3 * across))
     return 0.5 + 0.12 * np.stack([waves[0] + waves[2] + tiles, waves[1] - waves[2] + tiles, waves[3] + waves[1] - tiles], -1)
 
 
 def frame(index: int, cam: PinholeCamera, rng: np.random.Generator) -> RgbdFrame:
-    """What the camera sees, rendered."""
+    """Renders the camera's view of the walls."""
     T = pose(index)
     u, v = np.meshgrid(np.arange(cam.width), np.arange(cam.height))
     rays = np.stack([(u - cam.cx) / cam.fx, (v - cam.cy) / cam.fy, np.ones(u.shape)], -1) @ T[:3, :3].T
@@ -77,7 +77,7 @@ def frame(index: int, cam: PinholeCamera, rng: np.random.Generator) -> RgbdFrame
 
 
 def main() -> None:
-    """Fly and print."""
+    """Process the flight and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--preset', default='realtime')
     parser.add_argument('--frames', type=int, default=2000)

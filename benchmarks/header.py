@@ -1,4 +1,4 @@
-"""What every benchmark prints first: without it a number means nothing."""
+"""The header that every benchmark prints: commit, machine and speed, without which a number means nothing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CALIBRATION_RUNS = 7
 
 
 def timed_ms(function: Callable[[], object], runs: int) -> list[float]:
-    """Wall times of a few runs after one that does not count, milliseconds."""
+    """Returns the wall times of several runs after one warm-up run, in milliseconds."""
     function()
     times = []
     for _ in range(runs):
@@ -25,7 +25,7 @@ def timed_ms(function: Callable[[], object], runs: int) -> list[float]:
 
 
 def calibration_ms() -> float:
-    """Median time of a fixed piece of work on one core: how fast this machine is right now."""
+    """Returns the median time of a fixed computation on one core, a measure of the machine's current speed."""
     values = np.linspace(0.1, 1.0, 1_000_000, dtype=np.float32)
 
     def work() -> None:
@@ -36,12 +36,14 @@ def calibration_ms() -> float:
 
 
 def print_header(title: str, runs: int) -> None:
-    """Commit, machine, calibration and number of runs, as Markdown."""
+    """Print commit, machine, calibration time and number of runs as Markdown."""
     machine = provenance.machine()
+    memory_mb = machine['memory_mb']
+    memory = f'{memory_mb // 1024} GB' if isinstance(memory_mb, int) else 'unknown memory'
     print(f'### {title}\n')
     print(
         f'Commit `{(provenance.commit() or "unknown")[:18]}`; {machine["processor"]}, {machine["cores"]} cores, '
-        f'{machine["memory_mb"] // 1024} GB; {", ".join(f"{k} {v}" for k, v in provenance.versions().items())}; '
+        f'{memory}; {", ".join(f"{k} {v}" for k, v in provenance.versions().items())}; '
         f'calibration kernel {calibration_ms():.1f} ms; runs: {runs}.\n',
         flush=True,
     )

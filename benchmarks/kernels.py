@@ -1,14 +1,14 @@
-"""Times of the rasterizer's passes: one Gaussian per pixel, as a fresh map has them.
+"""Times of the rasterizer's passes, with one Gaussian per pixel as in a new map.
 
     python benchmarks/kernels.py [--runs 20]
 
-Forward is everything from the parameters to the images, projection, sorting and binning included; backward is
-everything from the images' gradients to the parameters' (map) or to the pose's alone (pose).
+Forward covers everything from the parameters to the images, including projection, sorting and binning. Backward covers
+everything from the gradients of the images to those of the parameters (map), or of the pose alone (pose).
 
-The roofline is the least time that the same work could take on the same cores. The work, counted and not measured: the
-arithmetic on every pixel of every tile that a Gaussian touches, and each array read and written once. The cores' best
-rates, measured: float32 operations of a matrix product, and bytes of a copy that does not fit the caches. Lists are not
-cut where a pixel is opaque, so what a pass leaves out there makes it look better than it is.
+The roofline is the shortest time in which the same cores could do the same work. The work is counted, not measured: the
+arithmetic for every pixel of every tile that a Gaussian touches, and each array read and written once. The best rates of
+the cores are measured: float32 operations in a matrix product, and bytes in a copy larger than the caches. The count
+includes Gaussians behind opaque pixels. A pass skips those, so it looks better here than it is.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ from splatam_core.tracking import make_tracker
 
 SIZES = ((320, 240), (640, 480))
 TILE = 8
-# As the kernels are written (csrc/kernels.inl), a fused multiply-add counted as two.
-FORWARD_OPERATIONS = 17  # a pixel of a splat: alpha, its bounds, the weight, five sums, the transmittance
+# Counted in csrc/kernels.inl; a fused multiply-add counts as two.
+FORWARD_OPERATIONS = 17  # per pixel of a splat: alpha, its bounds, the weight, five sums, the transmittance
 BACKWARD_OPERATIONS = 45
-EXPONENTIAL_OPERATIONS = 22  # an argument and its exponential
-PROJECTION_OPERATIONS = 120  # a Gaussian to its splat, or back
+EXPONENTIAL_OPERATIONS = 22  # an exponential and its argument
+PROJECTION_OPERATIONS = 120  # from a Gaussian to its splat, or back
 
 
 def camera(width: int, height: int) -> PinholeCamera:
-    """Of about 63 degrees."""
+    """Returns a camera with a horizontal field of view of about 63 degrees."""
     focal = 525.0 * width / 640
     return PinholeCamera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 def wavy_wall(cam: PinholeCamera) -> Gaussians:
-    """One Gaussian per pixel, one pixel wide, opacity one half, between 1 and 3 m."""
+    """Returns one Gaussian per pixel: one pixel wide, opacity 0.5, at a depth of 1 to 3 m."""
     v, u = torch.meshgrid(torch.arange(cam.height), torch.arange(cam.width), indexing='ij')
     z = 2 + 0.5 * torch.sin(u / 37) + 0.5 * torch.cos(v / 23)
     means = torch.stack([(u - cam.cx) / cam.fx * z, (v - cam.cy) / cam.fy * z, z], -1).reshape(-1, 3)
@@ -58,20 +58,20 @@ def wavy_wall(cam: PinholeCamera) -> Gaussians:
 
 
 def with_gradients(gaussians: Gaussians) -> Gaussians:
-    """Leaves that collect gradients."""
+    """Returns a copy whose parameters are leaves that collect gradients."""
     g = gaussians.detached()
     names = [name for name in ('means', 'log_scales', 'logit_opacities', 'rgb', 'rotations') if getattr(g, name) is not None]
     return replace(g, **{name: getattr(g, name).requires_grad_() for name in names})
 
 
 def backward(render: Render) -> None:
-    """From gradients of one in every value of every image."""
+    """Run the backward pass with a gradient of one for every value of every image."""
     outputs = [render.rgb, render.depth_acc, render.silhouette]
     torch.autograd.backward(outputs, [torch.ones_like(output) for output in outputs])
 
 
 def row(name: str, rasterizer: Rasterizer, cam: PinholeCamera, runs: int, anisotropic: bool = False) -> None:
-    """One line of the table: medians and the spread of forward plus backward."""
+    """Print a line of the table: medians, and the spread of forward plus backward."""
     still = wavy_wall(cam).anisotropic() if anisotropic else wavy_wall(cam)
     moving = with_gradients(still)
     pose = torch.eye(4)
@@ -86,25 +86,25 @@ def row(name: str, rasterizer: Rasterizer, cam: PinholeCamera, runs: int, anisot
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """Of one pass: float32 operations, bytes."""
+    """The float32 operations and the bytes moved of one pass, or per second."""
 
     operations: float
     moved: float
 
     def roofline_ms(self, rates: Work) -> float:
-        """The least time at given rates a second."""
+        """Returns the shortest possible time at these rates per second, in milliseconds."""
         return 1e3 * max(self.operations / rates.operations, self.moved / rates.moved)
 
 
 def wall_view(cam: PinholeCamera) -> View:
-    """The wall as a frame."""
+    """Returns the wall as a frame."""
     g = wavy_wall(cam)
     rgb8 = (255 * g.rgb).byte().view(cam.height, cam.width, 3)
     return View(cam, rgb8, g.means[:, 2].reshape(cam.height, cam.width).contiguous())
 
 
 def realtime_row(name: str, rasterizer: Rasterizer, cam: PinholeCamera, runs: int, threads: int) -> None:
-    """One step of fused fitting, and one frame of alignment: what preset `realtime` does, on its settings, to this wall."""
+    """Print the times of one alignment and of one fused optimizer step, with the settings of preset `realtime`."""
     config, wall, view = load_config('realtime'), GaussianMap(), wall_view(cam)
     wall.append(wavy_wall(cam))
     pose = torch.eye(4)
@@ -121,7 +121,7 @@ def realtime_row(name: str, rasterizer: Rasterizer, cam: PinholeCamera, runs: in
 
 
 def touched_tiles(gaussians: Gaussians, cam: PinholeCamera) -> int:
-    """How many tiles the Gaussians touch in all, seen from the origin: a disc of alpha 1/255 against squares."""
+    """Returns how many tiles all Gaussians touch, seen from the origin. A footprint is the disc where alpha exceeds 1/255."""
     z = gaussians.means[:, 2]
     centre = torch.stack([cam.fx * gaussians.means[:, 0] / z + cam.cx, cam.fy * gaussians.means[:, 1] / z + cam.cy])
     variance = (cam.fx * gaussians.log_scales[:, 0].exp() / z) ** 2 + BLUR_PX2
@@ -136,7 +136,7 @@ def touched_tiles(gaussians: Gaussians, cam: PinholeCamera) -> int:
 
 
 def work(gaussians: Gaussians, cam: PinholeCamera) -> tuple[Work, Work]:
-    """Of the forward and of the backward pass."""
+    """Returns the work of the forward and of the backward pass."""
     entries, count, pixels = touched_tiles(gaussians, cam), len(gaussians), cam.width * cam.height
     forward = Work(
         entries * (TILE**2 * FORWARD_OPERATIONS + 2 * TILE * EXPONENTIAL_OPERATIONS) + count * PROJECTION_OPERATIONS,
@@ -150,7 +150,7 @@ def work(gaussians: Gaussians, cam: PinholeCamera) -> tuple[Work, Work]:
 
 
 def best_rates(threads: int) -> Work:
-    """A second, on as many cores: of a matrix product, of a copy."""
+    """Returns the rates per second on this many cores: operations in a matrix product, bytes in a copy."""
     torch.set_num_threads(threads)
     matrix, long = torch.rand(1024, 1024), torch.rand(32_000_000)
     product, copied = torch.empty_like(matrix), torch.empty_like(long)
@@ -161,7 +161,7 @@ def best_rates(threads: int) -> Work:
 
 
 def print_roofline() -> None:
-    """What the passes of the table above would take at best."""
+    """Print the shortest possible times of the passes in the table above."""
     print('\n| threads | Gflop/s | GB/s | image | forward: Mflop, MB | roofline ms | backward: Mflop, MB | roofline ms |')
     print('|' + '---|' * 8)
     for threads in (1, 2):
@@ -175,7 +175,7 @@ def print_roofline() -> None:
 
 
 def native() -> Iterator[tuple[str, CpuRasterizer, PinholeCamera, int]]:
-    """The native kernels: name, rasterizer, camera and threads of each line."""
+    """Yields name, rasterizer, camera and threads for each line about the native code."""
     for size, threads in itertools.product(SIZES, (1, 2)):
         rasterizer = CpuRasterizer(threads)
         name = f'cpu, {rasterizer.instruction_set}, {threads} thread{"s"[: threads - 1]}'
@@ -197,7 +197,7 @@ def main() -> None:
     small = camera(64, 48)
     for name in ('cpu', 'reference'):
         row(f'{name}, 1 thread', make_rasterizer(name, 1), small, runs)
-    print('\n| backend | image | alignment of a frame, ms | step of fused fitting, ms |')
+    print('\n| backend | image | alignment of a frame, ms | fused optimizer step, ms |')
     print('|---|---|---|---|')
     for name, rasterizer, cam, threads in native():
         realtime_row(name, rasterizer, cam, runs, threads)

@@ -1,10 +1,10 @@
-"""The node beside a live camera: how old poses are, how many frames it has no time for, what it costs.
+"""The node with a live camera: the age of its poses, the frames that it drops, and its CPU and memory use.
 
     python benchmarks/live_node.py SOURCE [--preset quick] [--width 320] [--rate 30] [--max-frames N] [--runs 1]
 
-The recording is published as a camera would, at a fixed rate and whether anybody keeps up or not; ``queue_policy`` is
-``latest``. Latency runs from handing the later of a frame's two images to ROS until the pose has been received. What is
-published before the first pose is not counted: starting a map takes longer than a frame.
+The recording is published like a camera's images, at a fixed rate and without waiting for the node, whose ``queue_policy`` is
+``latest``. Latency is the time from handing the later of a frame's two images to ROS until the pose is received. Frames
+published before the first pose are not counted, because starting a map takes longer than a frame.
 """
 
 from __future__ import annotations
@@ -22,21 +22,19 @@ from live import Arrival, convert, graph, milliseconds
 from std_msgs.msg import Header
 
 START_TIMEOUT_S = 60.0
-MEASURING_S = 1.0  # at a time; the load is averaged over as many as fit
+MEASURING_S = 1.0  # duration of one measurement of the CPU load; the result is their mean
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
-    """One recording through the node.
+class Counts:
+    """The frames of one recording played into the node.
 
     Attributes:
-        latency_ms: of each pose.
-        early: frames dropped before the first pose was there, of those after the first one that was processed.
-        published: frames counted: those after that.
-        processed: of those, tracked or lost.
-        tracked: of those, with a pose.
-        cpu_percent: of one core, the node's average.
-        rss_mb: the node's at the end.
+        latency_ms: latency of each pose.
+        early: frames dropped between the first processed frame and the first pose.
+        published: frames published after the first pose.
+        processed: those of them that were tracked or lost.
+        tracked: those of them with a pose.
     """
 
     latency_ms: list[float]
@@ -44,14 +42,27 @@ class Run:
     published: int
     processed: int
     tracked: int
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One run of the node.
+
+    Attributes:
+        counts: its frames.
+        cpu_percent: mean CPU load of the node, in percent of one core.
+        rss_mb: resident memory of the node at the end, MiB.
+    """
+
+    counts: Counts
     cpu_percent: float
     rss_mb: float
 
 
-def count(published_ns: dict[int, int], poses: list[Arrival], done: list[Arrival]) -> tuple[list[float], int, int, int, int]:
-    """Latencies, frames dropped before the first pose was there, and frames published, processed and tracked from then on.
+def count(published_ns: dict[int, int], poses: list[Arrival], done: list[Arrival]) -> Counts:
+    """Count frames and measure latencies.
 
-    The first frames wait up to 0.4 s until the transport has introduced reader and writer, and arrive all at once.
+    The first frames arrive together, because discovery between reader and writer takes up to 0.4 s.
     """
     first, answers = poses[0], {item.stamp_ns for item in done}
     counted = {stamp_ns: at_ns for stamp_ns, at_ns in published_ns.items() if at_ns > first.received_ns}
@@ -59,14 +70,14 @@ def count(published_ns: dict[int, int], poses: list[Arrival], done: list[Arrival
     answered = [pose for pose in poses if pose.stamp_ns in counted]
     latency_ms = milliseconds([pose.received_ns - counted[pose.stamp_ns] for pose in answered])
     dropped_early = sum(stamp_ns not in answers for stamp_ns in early)
-    return latency_ms, dropped_early, len(counted), len(answers & counted.keys()), len(answered)
+    return Counts(latency_ms, dropped_early, len(counted), len(answers & counted.keys()), len(answered))
 
 
 def run_once(bag: Path, preset: str, rate_hz: float, folder: Path, parameters: dict[str, str]) -> Run:
     """Publish a recording once.
 
     Raises:
-        SystemExit: no pose came.
+        SystemExit: no pose arrived.
     """
     with graph(folder) as opened:
         poses = opened.listen('/splatam/pose')
@@ -74,7 +85,7 @@ def run_once(bag: Path, preset: str, rate_hz: float, folder: Path, parameters: d
         node = opened.start_node(preset, **parameters)
         camera = opened.start_camera(bag, folder / 'frames', '--rate', str(rate_hz))
         if not opened.spin_until(lambda: poses or not camera.is_running, START_TIMEOUT_S) or not poses:
-            sys.exit(f'no pose came; the node said:\n{node.log.read_text()}')
+            sys.exit(f'no pose arrived; the output of the node:\n{node.log.read_text()}')
         loads = []
         while camera.is_running:
             loads.append(opened.cpu_percent(node, MEASURING_S))
@@ -82,18 +93,19 @@ def run_once(bag: Path, preset: str, rate_hz: float, folder: Path, parameters: d
         rss_mb = node.rss_mb()
         lines = (line.split() for line in (folder / 'frames').read_text().splitlines())
         counts = count({int(stamp_ns): int(at_ns) for stamp_ns, at_ns in lines}, poses, done)
-        return Run(*counts, statistics.mean(loads[:-1] or loads), rss_mb)  # the last is partly after the last frame
+        return Run(counts, statistics.mean(loads[:-1] or loads), rss_mb)  # the last load extends beyond the last frame
 
 
 def row(number: int, run: Run) -> str:
-    """A line of the table."""
-    if not run.published:
-        sys.exit('the recording was over before the first pose came: choose a longer one')
-    median, p95 = (statistics.median(run.latency_ms), float(np.percentile(run.latency_ms, 95))) if run.latency_ms else 2 * (np.nan,)
-    dropped = 100 * (1 - run.processed / run.published)
+    """Returns a line of the table."""
+    frames = run.counts
+    if not frames.published:
+        sys.exit('the recording ended before the first pose: choose a longer one')
+    latency = frames.latency_ms or [np.nan]
+    dropped = 100 * (1 - frames.processed / frames.published)
     return (
-        f'| {number} | {median:.0f} | {p95:.0f} | {run.early} | {run.published} | {dropped:.1f} | {run.processed - run.tracked} '
-        f'| {run.cpu_percent:.0f} | {run.rss_mb:.0f} |'
+        f'| {number} | {statistics.median(latency):.0f} | {np.percentile(latency, 95):.0f} | {frames.early} | {frames.published} '
+        f'| {dropped:.1f} | {frames.processed - frames.tracked} | {run.cpu_percent:.0f} | {run.rss_mb:.0f} |'
     )
 
 
@@ -107,7 +119,7 @@ def main() -> None:
     parser.add_argument('--max-frames', type=int)
     parser.add_argument('--runs', type=int, default=1)
     parser.add_argument('-p', dest='parameters', action='append', default=[], metavar='NAME:=VALUE',
-                        help='a parameter of the node, as after --ros-args')  # fmt: skip
+                        help='a parameter of the node, in the form that --ros-args takes')  # fmt: skip
     args = parser.parse_args()
     parameters = dict(entry.split(':=', 1) for entry in args.parameters)
     with tempfile.TemporaryDirectory() as scratch:
@@ -117,7 +129,7 @@ def main() -> None:
         ]  # fmt: skip
     name = Path(args.source).name
     print_header(f'{name} live at {args.rate:g} Hz, preset `{args.preset}`, {args.width} pixels wide', args.runs)
-    print('| run | latency ms, median | p95 | dropped before the first pose | frames after it | dropped % | lost '
+    print('| run | latency ms, median | p95 | dropped before the first pose | frames after the first pose | dropped % | lost '
           '| CPU % of a core | RSS MB |')  # fmt: skip
     print('|---|---|---|---|---|---|---|---|---|')
     for number, run in enumerate(runs, 1):

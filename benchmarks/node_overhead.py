@@ -1,10 +1,10 @@
-"""What the node adds to SLAM: from a camera's stamp to the published pose, with a core that does nothing.
+"""The latency that the node adds to SLAM: from a camera's stamp to the published pose, with a core that does nothing.
 
     python benchmarks/node_overhead.py [--seconds 20] [--runs 3] [--width 640]
 
-A camera of 30 Hz in a process of its own stamps and publishes colour, depth and CameraInfo. The node, whose SLAM does
-nothing (``null.yaml``), and the least that a node can be (``echo.py``: same subscriptions, no decoding) take turns in
-answering with a pose. Latency ends where the answer is handed to ROS. Overhead is the difference of their medians.
+A camera process stamps and publishes colour, depth and CameraInfo at 30 Hz. Two nodes take turns in answering with a pose:
+the SLAM node, whose SLAM does nothing (``null.yaml``), and a minimal node (``echo.py``: same subscriptions, no decoding).
+Latency ends when the answer is handed to ROS. Overhead is the difference of the medians.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from header import print_header
 from live import HERE, Child, Graph, convert, graph, milliseconds
 
 RATE_HZ = 30.0
-WARM_UP_FRAMES = 150  # the first frame starts the map and takes seconds, and discovery may still be going on
+WARM_UP_FRAMES = 150  # the first frame starts the map, which takes seconds; discovery may also take a while
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +29,9 @@ class Run:
     """One process under one camera.
 
     Attributes:
-        latency_ms: from stamp to the answer's publishing, a frame.
-        cpu_percent: of one core.
-        answered: share of the frames after warming up.
+        latency_ms: time from the stamp to the publishing of the answer, for each frame.
+        cpu_percent: CPU load, in percent of one core.
+        answered: fraction of the frames answered after warming up.
     """
 
     latency_ms: list[float]
@@ -40,16 +40,16 @@ class Run:
 
 
 def measure(opened: Graph, child: Child, topic: str, bag: Path, frames: int) -> Run:
-    """Let the camera run for some frames and gather the answers.
+    """Run the camera for some frames and collect the answers.
 
     Raises:
-        SystemExit: nothing came, or somebody broke down.
+        SystemExit: no answer arrived, or a process failed.
     """
     log = child.log.with_suffix('.frames')
     arrivals = opened.listen(topic)
     camera = opened.start_camera(bag, log, '--now', '--rate', str(RATE_HZ), '--frames', str(WARM_UP_FRAMES + frames))
     if not opened.spin_until(lambda: arrivals, timeout_s=60):
-        sys.exit(f'no answers on {topic}; {child.log} and {camera.log} may say why')
+        sys.exit(f'no answers on {topic}: see {child.log} and {camera.log}')
     opened.spin_for(WARM_UP_FRAMES / RATE_HZ)
     cpu_percent = opened.cpu_percent(child, frames / RATE_HZ - 1)
     opened.spin_until(lambda: not camera.is_running, timeout_s=60)
@@ -65,7 +65,7 @@ def measure(opened: Graph, child: Child, topic: str, bag: Path, frames: int) -> 
 
 
 def run_once(name: str, bag: Path, frames: int, folder: Path) -> Run:
-    """One run of the node or of its counterpart, on a graph of its own."""
+    """Run the SLAM node or the minimal node once, on a graph of its own."""
     with graph(folder) as opened:
         if name == 'node':
             child = opened.start_node(str(HERE / 'null.yaml'))
@@ -74,7 +74,7 @@ def run_once(name: str, bag: Path, frames: int, folder: Path) -> Run:
 
 
 def row(name: str, runs: list[Run]) -> str:
-    """A line of the table; medians over the runs, and their spread."""
+    """Returns a line of the table: medians over the runs, and their spread."""
     medians = [statistics.median(run.latency_ms) for run in runs]
     p95 = statistics.median(float(np.percentile(run.latency_ms, 95)) for run in runs)
     cpu = statistics.median(run.cpu_percent for run in runs)
@@ -88,8 +88,8 @@ def row(name: str, runs: list[Run]) -> str:
 def main() -> None:
     """Measure in turns and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--seconds', type=float, default=20.0, help='of each run, after warming up')
-    parser.add_argument('--runs', type=int, default=3, help='of each')
+    parser.add_argument('--seconds', type=float, default=20.0, help='duration of each run after warming up (default: %(default)s)')
+    parser.add_argument('--runs', type=int, default=3, help='number of runs of each node (default: %(default)s)')
     parser.add_argument('--width', type=int, default=640)
     args = parser.parse_args()
     frames = round(args.seconds * RATE_HZ)
@@ -103,7 +103,7 @@ def main() -> None:
     print_header(f'Node overhead, {args.width} pixels wide, {RATE_HZ:g} Hz, {args.seconds:g} s a run', args.runs)
     print('| process | stamp to pose, ms, median (spread) | p95 ms | CPU % of a core | frames answered % |')
     print('|---|---|---|---|---|')
-    print(row('plain round trip', runs['echo']))
+    print(row('minimal node', runs['echo']))
     print(row('node, SLAM does nothing', runs['node']))
     pairs = zip(runs['node'], runs['echo'], strict=True)
     overheads = [statistics.median(node.latency_ms) - statistics.median(echo.latency_ms) for node, echo in pairs]

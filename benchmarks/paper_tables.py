@@ -1,13 +1,12 @@
-"""The paper's tables, as far as the recordings at hand allow: ablations, tracking and rendering, held-out views.
+"""Reproduces the paper's tables on the available recordings: ablations, tracking and rendering, held-out views.
 
     python benchmarks/paper_tables.py [--data ../shared/data] [--width 320] [--max-frames N] [--no-ablations] [--out ...]
 
-Ablations (Tables 4, 5 and S.1): on the fast walk through the synthetic room, on the start of 7scenes_redkitchen, and on
-every fifth frame of it; then some of them again, under the conditions that docs/ablations.md gives as reasons. Tracking
-and rendering (Tables 1 to 3): preset `splatam` on both recordings, scored as this project
-defines its metrics and, with `splatam_` in front, as the original's code computes them. Held-out views: the same with every
-8th frame kept out of mapping (`heldout_`). One thread each, one run after the other: hours. Runs that are finished are not
-done again.
+Ablations (Tables 4, 5 and S.1) use the fast walk through the synthetic room, the start of 7scenes_redkitchen, and every
+fifth frame of it. Some are repeated under the conditions that docs/ablations.md gives as reasons. Tracking and rendering
+(Tables 1 to 3) uses preset `splatam` on both recordings, with this project's metrics and, prefixed `splatam_`, those of the
+original code. Held-out views is the same with every 8th frame excluded from mapping (`heldout_`). Runs use one thread and
+follow one another, which takes hours. Finished runs are not repeated.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from header import print_header
 
 KITCHEN, DESK = '7scenes_redkitchen', 'tum_fr1_rpy'
 HOLDOUT = 8
-HONEST = ('frames', 'tracked', 'ate_rmse_m', 'psnr_db', 'psnr_full_db', 'ssim', 'depth_l1_m', 'num_gaussians', 'fps')
-NAMED = ('splatam_', 'heldout_')
+OWN = ('frames', 'tracked', 'ate_rmse_m', 'psnr_db', 'psnr_full_db', 'ssim', 'depth_l1_m', 'num_gaussians', 'fps')
+PREFIXES = ('splatam_', 'heldout_')
 EXIT_INTERRUPTED = 130
 
 
@@ -35,12 +34,12 @@ class Set:
     """A set of ablations.
 
     Attributes:
-        name: of its folder.
+        name: part of the folder's name.
         source: the recording.
-        stride: every how manieth frame of it.
+        stride: use every n-th frame.
         only: names of the variants; empty = all.
-        settings: of all of them, ``name=value``.
-        times: how many times as many frames as the others.
+        settings: ``name=value`` settings of all variants.
+        times: factor on the number of frames.
     """
 
     name: str
@@ -52,9 +51,9 @@ class Set:
 
 
 def sets(kitchen: str) -> tuple[Set, ...]:
-    """All there are; those after the third test what is given as the reason of a difference."""
+    """Returns all sets. The first three are the ablations; the others test the reasons given for differences."""
     room, silhouettes = 'synthetic:motion=fast', ('full', 'silhouette_050', 'no_silhouette')
-    blended = ('tracking.blended_depth=true',)
+    blended = ('tracking.paper.blended_depth=true',)
     return (
         Set('room', room), Set('redkitchen', kitchen), Set('redkitchen_every_5th', kitchen, 5),
         Set('room_blended_depth', room, only=silhouettes, settings=blended),
@@ -65,7 +64,7 @@ def sets(kitchen: str) -> tuple[Set, ...]:
 
 
 def splatam(*arguments: str, prints: bool = False) -> None:
-    """The command line in a process of its own; what fails there is said there, and is missing in the tables."""
+    """Run the command line in a process of its own. If it fails, it prints why, and the tables lack its values."""
     command = [sys.executable, '-m', 'splatam_core.cli', *arguments]
     code = subprocess.run(command, stdout=None if prints else sys.stderr, check=False).returncode
     if code == EXIT_INTERRUPTED:
@@ -88,7 +87,7 @@ def ablations(chosen: Set, args: argparse.Namespace) -> None:
 
 
 def scored_run(recording: Path, args: argparse.Namespace, holdout: int) -> Path:
-    """The folder of a run of preset `splatam` over a recording, made unless it is there."""
+    """Returns the folder of a run of preset `splatam` on a recording. Runs it if the folder has no scores."""
     frames = f'_{args.max_frames}' if args.max_frames else ''
     kind = f'holdout{holdout}' if holdout else 'all'
     folder = args.out / f'{recording.name}_{args.width}{frames}_{kind}'
@@ -101,24 +100,24 @@ def scored_run(recording: Path, args: argparse.Namespace, holdout: int) -> Path:
 
 
 def metrics(folder: Path) -> dict[str, object]:
-    """What a run's folder says; nothing where there is none."""
+    """Returns the metrics of a run folder; empty if it has none."""
     path = folder / 'metrics.json'
     return json.loads(path.read_text()) if path.is_file() else {}
 
 
 def print_metrics(folders: Sequence[Path]) -> None:
-    """Runs side by side: the honest metrics, then those with a name in front."""
+    """Print runs side by side: this project's metrics, then those with a prefix."""
     columns = [metrics(folder) for folder in folders]
-    named = sorted({name for column in columns for name in column if name.startswith(NAMED)}, key=_by_prefix)
+    named = sorted({name for column in columns for name in column if name.startswith(PREFIXES)}, key=_by_prefix)
     print('| metric | ' + ' | '.join(folder.name for folder in folders) + ' |')
     print('|---' * (len(folders) + 1) + '|')
-    for name in (*HONEST, *named):
+    for name in (*OWN, *named):
         print(f'| `{name}` | ' + ' | '.join(_text(column.get(name)) for column in columns) + ' |')
     print(flush=True)
 
 
 def _by_prefix(name: str) -> tuple[int, str]:
-    return next(index for index, prefix in enumerate(NAMED) if name.startswith(prefix)), name
+    return next(index for index, prefix in enumerate(PREFIXES) if name.startswith(prefix)), name
 
 
 def _text(value: object) -> str:
@@ -128,21 +127,21 @@ def _text(value: object) -> str:
 
 
 def main() -> None:
-    """Run what is not done yet, and print all tables."""
+    """Do the missing runs and print all tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     default = Path(os.environ.get('SPLATAM_DATA') or '../shared/data')
     parser.add_argument('--data', type=Path, default=default, help=f'folder of {KITCHEN} and {DESK} (default: %(default)s)')
-    parser.add_argument('--width', type=int, default=320, help='of tracking and rendering (default: %(default)s)')
-    parser.add_argument('--max-frames', type=int, help='of tracking and rendering (default: all)')
-    parser.add_argument('--ablation-width', type=int, default=128, help='default: %(default)s')
-    parser.add_argument('--ablation-frames', type=int, default=40, help='default: %(default)s')
-    parser.add_argument('--only', nargs='+', metavar='NAME', help='some of the ablations')
-    parser.add_argument('--no-ablations', action='store_true', help='leave out the first part')
-    parser.add_argument('--out', type=Path, default=Path('out/paper_tables'), help='default: %(default)s')
+    parser.add_argument('--width', type=int, default=320, help='image width in tracking and rendering (default: %(default)s)')
+    parser.add_argument('--max-frames', type=int, help='number of frames in tracking and rendering (default: all)')
+    parser.add_argument('--ablation-width', type=int, default=128, help='image width in ablations (default: %(default)s)')
+    parser.add_argument('--ablation-frames', type=int, default=40, help='number of frames in ablations (default: %(default)s)')
+    parser.add_argument('--only', nargs='+', metavar='NAME', help='names of the ablations to run (default: all)')
+    parser.add_argument('--no-ablations', action='store_true', help='skip the ablations')
+    parser.add_argument('--out', type=Path, default=Path('out/paper_tables'), help='folder of the runs (default: %(default)s)')
     args = parser.parse_args()
     recordings = [args.data / KITCHEN, args.data / DESK]
     if missing := [str(path) for path in recordings if not path.is_dir()]:
-        parser.error(f'{", ".join(missing)} is absent: --data or SPLATAM_DATA names the folder of the recordings')
+        parser.error(f'{", ".join(missing)} is absent: set --data or SPLATAM_DATA to the folder of the recordings')
 
     for chosen in () if args.no_ablations else sets(str(recordings[0])):
         ablations(chosen, args)

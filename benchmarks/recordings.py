@@ -1,9 +1,9 @@
-"""A recording through bag, player, DDS and node, and the same bag offline: are they the same, and how good?
+"""Compares a recording played through player, DDS and node with the same bag processed offline: equality and scores.
 
     python benchmarks/recordings.py SOURCE [--preset quick] [--width 320] [--max-frames N] [--out out/benchmarks/NAME]
 
-Both runs use one thread, so that they can be compared bit for bit; they run one after the other. A third run, with all
-cores, is for the speed. Reports are in the three folders.
+The two runs use one thread each, one after the other, so that they can be compared bit for bit. A third run uses all cores,
+to measure the speed. Each of the three folders holds a report.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ COLUMNS = (
 
 
 def through_the_node(bag: Path, out: Path, preset: str, overrides: list[str]) -> None:
-    """Play a bag into the node, frame for frame."""
+    """Play a bag into the node, without dropping a frame."""
     parameters = [f'preset:={preset}', f'save_path:={out}', 'queue_policy:=all', 'exit_on_publisher_end:=true',
                   'slam.threads:=1', *(f'slam.{entry.replace("=", ":=", 1)}' for entry in overrides)]  # fmt: skip
     with Processes() as processes:
@@ -39,14 +39,14 @@ def through_the_node(bag: Path, out: Path, preset: str, overrides: list[str]) ->
 
 
 def offline(bag: Path, out: Path, preset: str, overrides: list[str]) -> None:
-    """The same frames without ROS."""
+    """Process the same frames without ROS."""
     flags = [word for entry in overrides for word in ('--set', entry)]
     command = ['-m', 'splatam_core.cli', 'run', str(bag), '--preset', preset, '--out', str(out), *flags]
     subprocess.run([sys.executable, *command], check=True)
 
 
 def table_row(run: str, folder: Path) -> str:
-    """A run folder's metrics as a line of Markdown."""
+    """Returns the metrics of a run folder as a line of Markdown."""
     metrics = json.loads((folder / 'metrics.json').read_text())
     values = {**metrics, 'run': run, 'ate_cm': 100 * metrics['ate_rmse_m'], 'depth_cm': 100 * metrics['depth_l1_m']}
     return '| ' + ' | '.join(form.format(**values) for _, form in COLUMNS) + ' |'

@@ -1,10 +1,10 @@
-"""How far a recording's own reference and camera can be trusted, and what that does to the trajectory error.
+"""How reliable are a recording's ground truth and camera calibration, and how do they affect the trajectory error?
 
     python benchmarks/reference_poses.py SOURCE [--preset realtime] [--width 320] [--focal 1,1.02,1.04,1.06]
 
-Prints the reference's largest step beside its neighbours; what is left of the error when the reference is compared with
-itself without that step; and the error of a preset, before and after that step too, with the focal lengths as they are
-given and scaled. A recording whose error falls with another focal length is not calibrated better than that.
+Prints the step of the reference poses that stands out most from its neighbours, and the error of the reference compared
+with itself without that step. Then prints the error of a preset over all frames, before and after that step, with the
+focal lengths as given and scaled. If the error falls with another focal length, the calibration is no better than that.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ NEIGHBOURS = 5
 
 
 def steps(T_world_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[N - 1, 6] twists from each pose to the next."""
+    """Returns the [N - 1, 6] twists from each pose to the next."""
     return np.array([se3.log(se3.inverse(a) @ b) for a, b in pairwise(T_world_cam)])
 
 
 def without_step(T_world_cam: NDArray[np.float64], at: int) -> NDArray[np.float64]:
-    """The same poses, but that step is the mean of those beside it."""
+    """Returns the poses with one step replaced by the mean of the steps beside it."""
     twists = steps(T_world_cam)
     twists[at] = (twists[at - 1] + twists[at + 1]) / 2
     poses = [T_world_cam[0]]
@@ -44,7 +44,7 @@ def without_step(T_world_cam: NDArray[np.float64], at: int) -> NDArray[np.float6
 
 
 def tracked(frames: list[RgbdFrame], preset: str, focal: float) -> Trajectory:
-    """The preset's trajectory, with focal lengths scaled."""
+    """Returns the trajectory of a preset with scaled focal lengths."""
     config = load_config(preset, ['threads=1'])
     apply_threads(config)
     slam, stamps_ns, poses = Slam(config), [], []
@@ -58,13 +58,13 @@ def tracked(frames: list[RgbdFrame], preset: str, focal: float) -> Trajectory:
 
 
 def ate_cm(estimate: Trajectory, truth: Trajectory, begin: int = 0, end: int | None = None) -> float:
-    """RMSE of some of the poses, aligned by themselves."""
+    """Returns the RMSE of the poses from ``begin`` to ``end``, aligned on their own, in centimetres."""
     part = Trajectory(estimate.stamps_ns[begin:end], estimate.T_world_cam[begin:end])
     return 100 * trajectory_error(part, truth).rmse_m
 
 
 def main() -> None:
-    """Print it all."""
+    """Print the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('source')
     parser.add_argument('--preset', default='realtime')

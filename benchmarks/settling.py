@@ -1,9 +1,9 @@
-"""How far a fresh map renders from the depth it was made of, with and without settling (decision 0003).
+"""The depth bias of a new map, with and without the initial depth-bias correction (decision 0003).
 
     python benchmarks/settling.py
 
-First frame of the synthetic room, preset quick, one thread. Bias is the mean of rendered minus read depth where the
-silhouette passes the tracking gate.
+Uses the first frame of the synthetic room, preset quick and one thread. Bias is the mean of rendered minus measured depth,
+where the silhouette exceeds the tracking threshold.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame
 
 
-def bias_mm(frame: RgbdFrame, settle: int, steps: int) -> float:
-    """Mean depth bias of the map after its first frame, millimetres."""
-    config = load_config('quick', {'threads': 1, 'densification.bias_correction_rounds': settle, 'mapping.iterations': steps})
+def bias_mm(frame: RgbdFrame, rounds: int, steps: int) -> float:
+    """Returns the mean depth bias of the map after its first frame, in millimetres."""
+    config = load_config('quick', {'threads': 1, 'densification.bias_correction_rounds': rounds, 'mapping.iterations': steps})
     slam = Slam(config)
     slam.process(frame)
     view = View.from_frame(frame, config.depth)
@@ -33,13 +33,13 @@ def bias_mm(frame: RgbdFrame, settle: int, steps: int) -> float:
 def main() -> None:
     """Print the table."""
     apply_threads(load_config('quick'))
-    print_header('Depth bias of a fresh map', 1)
-    print('| image | rounds of settling | bias mm | after 10 mapping steps | after 60 |\n|---|---|---|---|---|')
+    print_header('Depth bias of a new map', 1)
+    print('| image | rounds of correction | bias mm | after 10 mapping steps | after 60 |\n|---|---|---|---|---|')
     for width in (96, 320):
         frame = open_sequence('synthetic', width=width, max_frames=1)[0]
-        for settle in (0, 1, 3):
-            biases = ' | '.join(f'{bias_mm(frame, settle, steps):+.1f}' for steps in (0, 10, 60))
-            print(f'| {frame.camera.width}x{frame.camera.height} | {settle} | {biases} |', flush=True)
+        for rounds in (0, 1, 3):
+            biases = ' | '.join(f'{bias_mm(frame, rounds, steps):+.1f}' for steps in (0, 10, 60))
+            print(f'| {frame.camera.width}x{frame.camera.height} | {rounds} | {biases} |', flush=True)
 
 
 if __name__ == '__main__':

@@ -1,10 +1,10 @@
-"""The node for a long time: a recording is played over and over, and its memory is watched.
+"""The node over a long time: plays a recording in a loop and samples the memory of node and player.
 
     python benchmarks/soak.py [SOURCE] [--minutes 30] [--preset quick] [--width 320] [--rate 1] [--max-frames 150]
 
-The player loops, stamps included, so that the map starts anew with each loop; the node drops what it has no time for,
-as beside a camera. Every output of the node is listened to, and the run is saved at each loop. Frames in are counted
-by their CameraInfo, frames out by ``~/processed``.
+The stamps start again with each loop, so the node starts a new map. The node drops frames that it has no time for, as with
+a live camera. Every output of the node has a subscriber, and the run is saved at each loop. Input frames are counted by
+their CameraInfo, output frames by ``~/processed``.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from msg_adapters.factory import message_class
 from splatam_ros.node.outputs import OUTPUTS
 
 START_TIMEOUT_S = 60.0
-SETTLING = 0.25  # share of the time that memory may grow: caches, allocators, the first map
+SETTLING = 0.25  # fraction of the time in which memory may grow: caches, allocators, the first map
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The state at some time.
+    """Memory and frame counts at one time.
 
     Attributes:
-        minutes: since the first frame.
-        rss_mb: of the node.
-        player_mb: of the player.
-        frames_in: so far.
-        processed: tracked and lost, so far.
-        poses: so far.
+        minutes: time since the first frame.
+        rss_mb: resident memory of the node, MiB.
+        player_mb: resident memory of the player, MiB.
+        frames_in: input frames so far.
+        processed: frames tracked or lost so far.
+        poses: poses published so far.
     """
 
     minutes: float
@@ -54,7 +54,7 @@ def watch(opened: Graph, node: Child, player: Child, minutes: float, period_s: f
     """Sample while both run.
 
     Raises:
-        SystemExit: one of them ended, or no frame came.
+        SystemExit: one of them ended, or no frame was processed.
     """
     infos = opened.listen('/rgb/camera_info', CameraInfo)
     done = opened.listen('/splatam/processed', Header)
@@ -62,13 +62,13 @@ def watch(opened: Graph, node: Child, player: Child, minutes: float, period_s: f
     for output in OUTPUTS[1:]:
         opened.drain(f'/splatam/{output.topic}', message_class(output.type_name))
     if not opened.spin_until(lambda: done, START_TIMEOUT_S):
-        sys.exit(f'no frame came out; the node said:\n{node.log.read_text()}')
+        sys.exit(f'no frame was processed; the output of the node:\n{node.log.read_text()}')
     samples: list[Sample] = []
     started_s = time.monotonic()
     while (elapsed_s := time.monotonic() - started_s) < 60 * minutes:
         for child in (node, player):
             if not child.is_running:
-                sys.exit(f'ended after {elapsed_s / 60:.1f} minutes; it said:\n{child.log.read_text()}')
+                sys.exit(f'ended after {elapsed_s / 60:.1f} minutes; its output:\n{child.log.read_text()}')
         samples.append(
             Sample(elapsed_s / 60, node.rss_mb(), player.rss_mb(), len(infos), len(done), len(poses))
         )  # fmt: skip
@@ -77,13 +77,13 @@ def watch(opened: Graph, node: Child, player: Child, minutes: float, period_s: f
 
 
 def slope(samples: list[Sample]) -> float:
-    """MiB a minute of the node's memory, least squares, once it has settled."""
+    """Returns the growth of the node's memory after the settling time, in MiB per minute (least squares)."""
     settled = [sample for sample in samples if sample.minutes >= SETTLING * samples[-1].minutes]
     return float(np.polyfit([s.minutes for s in settled], [s.rss_mb for s in settled], 1)[0])
 
 
 def print_table(samples: list[Sample], rows: int) -> None:
-    """Some of the samples, the first and the last among them, and what follows from all."""
+    """Print ``rows`` of the samples, including the first and the last, and a summary of all."""
     print('| minute | node MB | player MB | frames in | processed | poses |\n|---|---|---|---|---|---|')
     for i in sorted(set(np.linspace(0, len(samples) - 1, rows).round().astype(int))):
         s = samples[i]
@@ -96,14 +96,14 @@ def print_table(samples: list[Sample], rows: int) -> None:
 
 
 def main() -> None:
-    """Play, watch, print."""
+    """Play the recording and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('source', nargs='?', default='synthetic')
     parser.add_argument('--minutes', type=float, default=30.0)
     parser.add_argument('--preset', default='quick')
     parser.add_argument('--width', type=int, default=320)
     parser.add_argument('--max-frames', type=int, default=150)
-    parser.add_argument('--rate', type=float, default=1.0, help='of playback')
+    parser.add_argument('--rate', type=float, default=1.0, help='playback rate (default: %(default)s)')
     args = parser.parse_args()
     title = f'{Path(args.source).name}, {args.minutes:g} minutes of looping, preset `{args.preset}`'
     print_header(f'{title}, {args.width} pixels wide, rate {args.rate:g}', 1)
@@ -116,7 +116,7 @@ def main() -> None:
             samples = watch(opened, node, player, args.minutes, period_s)
             warnings = [line for line in node.log.read_text().splitlines() if '[WARN]' in line or '[ERROR]' in line]
     print_table(samples, rows=16)
-    print(f'\nThe node warned {len(warnings)} times' + (f', last: {warnings[-1]}' if warnings else '.'))
+    print(f'\nWarnings and errors of the node: {len(warnings)}' + (f', last: {warnings[-1]}' if warnings else '.'))
 
 
 if __name__ == '__main__':

@@ -2,10 +2,10 @@
 
     python benchmarks/systems.py SOURCE [--width 320] [--runs 5] [--systems realtime,quick,open3d,opencv] [--plot FILE.png]
 
-Every run is a process of its own, one after the other, the systems taking turns; frames are decoded before the clock
+Each run is a process of its own. Runs follow one another, and the systems take turns. Frames are decoded before the clock
 starts. Run k of a preset has seed k. A system is a preset, ``open3d`` (``pip install open3d``; voxel-block grid, 3.0/512 m
-voxels, frame to model) or ``opencv`` (frame to frame, no map). ``NAME:60`` runs on the first 60 frames, ``NAME*1`` once
-instead of --runs times; ``NAME[key=value;...]`` changes settings of a preset.
+voxels, frame to model) or ``opencv`` (frame to frame, no map). ``NAME:60`` uses the first 60 frames, ``NAME*1`` runs once
+instead of --runs times, and ``NAME[key=value;...]`` changes settings of a preset.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -38,12 +37,12 @@ from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame, StageTimings
 
 Poses = list[NDArray[np.float64] | None]
-SCORED_EVERY = 7  # no multiple of the keyframes' distance: those the map knows better
+SCORED_EVERY = 7  # shares few frames with the keyframes, to which the map was fitted
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Of one run."""
+    """The result of one run; ``mean_stages_ms`` holds the mean time per frame of each stage, empty for other systems."""
 
     frames: int
     tracked: int
@@ -55,8 +54,18 @@ class Outcome:
     mean_stages_ms: dict[str, float]
 
 
-def run_ours(frames: Sequence[RgbdFrame], preset: str, overrides: list[str]) -> tuple[Poses, float, Slam, dict[str, float]]:
-    """A preset, frame by frame. Also the mean of a frame's stages, and its share of ``finish``."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The poses that a system found (None = lost), its wall time, and for a preset the map and the times of its stages."""
+
+    poses: Poses
+    seconds: float
+    slam: Slam | None = None
+    mean_stages_ms: dict[str, float] = field(default_factory=dict)
+
+
+def run_ours(frames: Sequence[RgbdFrame], preset: str, overrides: list[str]) -> Estimate:
+    """Run a preset. The time of ``finish`` is divided among the frames."""
     config = load_config(preset, overrides)
     apply_threads(config)
     slam = Slam(config)
@@ -67,11 +76,11 @@ def run_ours(frames: Sequence[RgbdFrame], preset: str, overrides: list[str]) -> 
     end = time.perf_counter()
     stages_ms = {name: statistics.mean(getattr(r.timings, name) for r in results) for name in StageTimings.__slots__}
     stages_ms['finish'] = 1e3 * (end - processed) / len(frames)
-    return [result.T_world_cam for result in results], end - begin, slam, stages_ms
+    return Estimate([result.T_world_cam for result in results], end - begin, slam, stages_ms)
 
 
-def run_open3d(frames: Sequence[RgbdFrame]) -> tuple[Poses, float]:
-    """Dense SLAM as in Open3D's own example."""
+def run_open3d(frames: Sequence[RgbdFrame]) -> Estimate:
+    """Run dense SLAM as in Open3D's own example."""
     import open3d as o3d
 
     camera, device = frames[0].camera, o3d.core.Device('CPU:0')
@@ -94,15 +103,16 @@ def run_open3d(frames: Sequence[RgbdFrame]) -> tuple[Poses, float]:
         model.update_frame_pose(index, T_world_cam)
         model.integrate(live, 1000.0, 4.0, 8.0)
         model.synthesize_model_frame(rendered, 1000.0, 0.1, 4.0, 8.0, False)
-    return poses, time.perf_counter() - begin
+    return Estimate(poses, time.perf_counter() - begin)
 
 
-def run_opencv(frames: Sequence[RgbdFrame]) -> tuple[Poses, float]:
-    """RGB-D odometry between consecutive frames."""
+def run_opencv(frames: Sequence[RgbdFrame]) -> Estimate:
+    """Run RGB-D odometry between consecutive frames."""
     settings = cv2.OdometrySettings()
     settings.setCameraMatrix(frames[0].camera.matrix.astype(np.float32))
     odometry = cv2.Odometry(cv2.OdometryType_RGB_DEPTH, settings, cv2.OdometryAlgoType_COMMON)
-    T_world_cam, last, poses = np.eye(4), None, []
+    T_world_cam, last = np.eye(4), None
+    poses: Poses = []
     begin = time.perf_counter()
     for frame in frames:
         depth = np.where(frame.depth_m > 0, frame.depth_m, np.float32(np.nan))
@@ -113,54 +123,78 @@ def run_opencv(frames: Sequence[RgbdFrame]) -> tuple[Poses, float]:
                 T_world_cam = T_world_cam @ np.linalg.inv(motion)
         poses.append(T_world_cam.copy())
         last = pair
-    return poses, time.perf_counter() - begin
+    return Estimate(poses, time.perf_counter() - begin)
 
 
-def run_one(system: SimpleNamespace, source: str, width: int, seed: int) -> Outcome:
-    """One system, in this process."""
+def run_one(system: System, source: str, width: int, seed: int) -> Outcome:
+    """Run a system in this process."""
     sequence = open_sequence(source, width=width, max_frames=system.frames)
     frames = [sequence[index] for index in range(len(sequence))]
-    slam, stages_ms = None, {}
     if system.name == 'open3d':
-        poses, seconds = run_open3d(frames)
+        found = run_open3d(frames)
     elif system.name == 'opencv':
-        poses, seconds = run_opencv(frames)
+        found = run_opencv(frames)
     else:
-        poses, seconds, slam, stages_ms = run_ours(frames, system.name, [f'seed={seed}', *system.overrides])
+        found = run_ours(frames, system.name, [f'seed={seed}', *system.overrides])
     peak = provenance.peak_rss_mb()
-    tracked = [(frame, pose) for frame, pose in zip(frames, poses) if pose is not None]
+    tracked = [(frame, pose) for frame, pose in zip(frames, found.poses) if pose is not None]
     estimate = Trajectory(np.array([f.stamp_ns for f, _ in tracked]), np.array([pose for _, pose in tracked]))
     truth = sequence.ground_truth()
     psnr_db = None
-    if slam is not None:
+    if (slam := found.slam) is not None:
         scorer = ViewScorer(slam.map.gaussians, rasterizer_for(slam.config)[0], slam.config.depth)
         psnr_db = mean_scores(scorer.score(*pair) for pair in tracked[::SCORED_EVERY]).psnr_db
     return Outcome(
-        len(frames), len(tracked), seconds, None if truth is None else 100 * trajectory_error(estimate, truth).rmse_m,
-        psnr_db, slam and slam.num_gaussians, peak, stages_ms,
-    )  # fmt: skip
+        frames=len(frames),
+        tracked=len(tracked),
+        seconds=found.seconds,
+        ate_cm=None if truth is None else 100 * trajectory_error(estimate, truth).rmse_m,
+        psnr_db=psnr_db,
+        num_gaussians=None if slam is None else slam.num_gaussians,
+        peak_rss_mb=peak,
+        mean_stages_ms=found.mean_stages_ms,
+    )
 
 
-def parsed(text: str, runs: int) -> SimpleNamespace:
-    """``NAME[settings]:frames*runs``."""
+@dataclass(frozen=True, slots=True)
+class System:
+    """One entry of --systems.
+
+    Attributes:
+        text: the entry itself.
+        name: a preset, ``open3d`` or ``opencv``.
+        overrides: ``key=value`` settings of a preset.
+        frames: number of frames to use; None = all.
+        runs: number of runs.
+    """
+
+    text: str
+    name: str
+    overrides: list[str]
+    frames: int | None
+    runs: int
+
+
+def parsed(text: str, runs: int) -> System:
+    """Parse ``NAME[settings]:frames*runs``."""
     match = re.fullmatch(r'(?P<name>[^\[:*]+)(\[(?P<set>[^\]]*)\])?(:(?P<frames>\d+))?(\*(?P<runs>\d+))?', text)
     if match is None:
         raise SystemExit(f"'{text}': expected NAME, NAME:FRAMES, NAME*RUNS or NAME[key=value;...]")
     overrides = [entry for entry in (match['set'] or '').split(';') if entry]
     frames = int(match['frames']) if match['frames'] else None
-    return SimpleNamespace(text=text, name=match['name'], overrides=overrides, frames=frames, runs=int(match['runs'] or runs))
+    return System(text=text, name=match['name'], overrides=overrides, frames=frames, runs=int(match['runs'] or runs))
 
 
-def in_a_process(system: SimpleNamespace, args: argparse.Namespace, seed: int) -> Outcome:
-    """The same, in a fresh process: memory and threads of one run are nothing to the next."""
+def in_a_process(system: System, args: argparse.Namespace, seed: int) -> Outcome:
+    """Run a system in a new process, so that memory and threads of one run do not affect the next."""
     command = [sys.executable, __file__, args.source, '--width', str(args.width), '--systems', system.text, '--one']
     command += ['--seed', str(seed)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     return Outcome(**json.loads(done.stdout.splitlines()[-1]))
 
 
-def row(system: SimpleNamespace, outcomes: list[Outcome], open3d_fps: float | None) -> str:
-    """Medians and spread; of the frames tracked the least."""
+def row(system: System, outcomes: list[Outcome], open3d_fps: float | None) -> str:
+    """Returns a line of the table: medians with spread, and the smallest number of tracked frames."""
     fps = [o.frames / o.seconds for o in outcomes]
 
     def known(name: str) -> list[float]:
@@ -176,35 +210,34 @@ def row(system: SimpleNamespace, outcomes: list[Outcome], open3d_fps: float | No
 
 
 def spread(values: list[float], digits: int, with_extremes: bool = True) -> str:
-    """The median, and the least and the most where they differ."""
+    """Returns the median, followed by the least and the most value where they differ."""
     if not values:
         return '–'
     median, least, most = (f'{of(values):.{digits}f}' for of in (statistics.median, min, max))
     return f'{median} ({least}–{most})' if with_extremes and least != most else median
 
 
-def plot(path: Path, systems: list[SimpleNamespace], outcomes: dict[str, list[Outcome]], title: str) -> None:
-    """Frames per second against trajectory error."""
+def plot(path: Path, systems: list[System], outcomes: dict[str, list[Outcome]], title: str) -> None:
+    """Plot trajectory error over frames per second; the recording needs a ground truth."""
     import matplotlib
 
     matplotlib.use('Agg')
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(figsize=(6, 4), layout='constrained')
-    highest_cm = max(statistics.median(o.ate_cm for o in outcomes[system.text]) for system in systems)
-    for index, system in enumerate(systems):
-        done = outcomes[system.text]
-        x, y = (statistics.median(values) for values in ([o.frames / o.seconds for o in done], [o.ate_cm for o in done]))
+    ates_cm = [statistics.median(o.ate_cm for o in outcomes[system.text] if o.ate_cm is not None) for system in systems]
+    for index, (system, y) in enumerate(zip(systems, ates_cm)):
+        x = statistics.median(o.frames / o.seconds for o in outcomes[system.text])
         axes.plot(x, y, 'o')
         axes.annotate(system.text, (x, y), xytext=(5, 4 if index % 2 else -12), textcoords='offset points')
-    axes.set(xscale='log', xlabel='frames per second', ylabel='ATE RMSE, cm', title=title, ylim=(0, 1.15 * highest_cm))
-    axes.margins(x=0.25)  # names are to the right of their points
+    axes.set(xscale='log', xlabel='frames per second', ylabel='ATE RMSE, cm', title=title, ylim=(0, 1.15 * max(ates_cm)))
+    axes.margins(x=0.25)  # room for the names, to the right of their points
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=120)
 
 
 def main() -> None:
-    """Run all in turns and print the table."""
+    """Run the systems in turns and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('source')
     parser.add_argument('--width', type=int, default=320)
@@ -236,7 +269,7 @@ def main() -> None:
         runs = [outcome.mean_stages_ms for outcome in outcomes[system.text]]
         if runs[0]:
             stages = (f'{name} {statistics.median(run[name] for run in runs):.1f}' for name in runs[0])
-            print(f'\n`{system.text}`, mean ms of a frame: ' + ', '.join(stages) + '.')
+            print(f'\n`{system.text}`, mean ms per frame: ' + ', '.join(stages) + '.')
     print(f'\nPSNR over every {SCORED_EVERY}th frame, final map, estimated poses, pixels with depth.')
     if args.plot:
         plot(args.plot, systems, outcomes, name)

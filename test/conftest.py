@@ -1,9 +1,11 @@
-"""What tests of every part share."""
+"""Fixtures and hooks for all tests."""
 
 from __future__ import annotations
 
+import fcntl
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -16,9 +18,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Rclpy checks the fields of messages in tests; it is too slow to do so otherwise. Threads as in our processes.
+    """Make rclpy check the fields of messages, which is too slow outside tests, and limit threads as the processes do.
 
-    Where there is no GPU, Triton interprets its kernels; it decides so when they are imported.
+    Without a GPU, Triton interprets its kernels. It reads the variable when the kernels are imported.
     """
     os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
     if not torch.cuda.is_available():
@@ -26,18 +28,49 @@ def pytest_configure(config: pytest.Config) -> None:
     apply_threads(SlamConfig())
 
 
+@pytest.hookimpl(tryfirst=True)  # before -m selects
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that start ROS processes and those that read a real recording."""
+    for item in items:
+        fixtures = getattr(item, 'fixturenames', ())
+        if 'graph' in fixtures or item.path.name == 'test_demo.py':
+            item.add_marker('ros')
+        if 'recording' in fixtures:
+            item.add_marker('recording')
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Run a test marked ``alone`` while no other worker of pytest-xdist runs a test."""
+    with machine(exclusive=item.get_closest_marker('alone') is not None):
+        yield
+
+
+@contextmanager
+def machine(exclusive: bool) -> Iterator[None]:
+    """Hold a lock that test processes share, or that one of them has for itself.
+
+    The first file is a gate: while a test waits for the exclusive lock, no new test can take the shared one.
+    """
+    with Path(__file__).open('rb') as gate, (ROOT / 'setup.py').open('rb') as lock:
+        fcntl.flock(gate, fcntl.LOCK_EX)
+        fcntl.flock(lock, fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH)
+        fcntl.flock(gate, fcntl.LOCK_UN)
+        yield
+
+
 @pytest.fixture(scope='session')
 def recording() -> Callable[[str], Path]:
-    """``recording('tum_fr1_rpy')``: the folder of a real recording.
+    """``recording('tum_fr1_rpy')`` returns the folder of a real recording.
 
-    Skips the test where the recordings are absent; fails it in CI, where they must be there.
+    If it is absent, the test is skipped; in CI it fails.
     """
 
     def find(name: str) -> Path:
         data = Path(os.environ.get('SPLATAM_DATA') or ROOT.parent / 'shared' / 'data')
         if (data / name).is_dir():
             return data / name
-        message = f'{data / name} is absent; SPLATAM_DATA names the folder of the recordings'
+        message = f'{data / name} is absent; set SPLATAM_DATA to the folder of the recordings'
         if os.environ.get('CI', '').lower() in ('true', '1'):
             pytest.fail(message)
         pytest.skip(message)
@@ -47,7 +80,7 @@ def recording() -> Callable[[str], Path]:
 
 @pytest.fixture(scope='session')
 def room() -> Callable[..., SyntheticSequence]:
-    """``room(frames=3, width=64, noise=False)``: a short synthetic recording; cheap after the first."""
+    """``room(frames=3, width=64, noise=False)`` returns a short synthetic recording. Only the first call is slow."""
 
     def make(frames: int = 3, width: int = 64, *, noise: bool = True, seed: int = 0) -> SyntheticSequence:
         return SyntheticSequence(seed=seed, noise=noise, frames=frames, width=width)

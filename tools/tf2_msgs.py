@@ -1,8 +1,8 @@
-"""Builds tf2_msgs, which ROS from pip lacks, for this Python: ``python tools/tf2_msgs.py PREFIX``.
+"""Builds tf2_msgs for this Python: ``python tools/tf2_msgs.py PREFIX``. ROS from pip does not contain it.
 
-It is generated from its one message by ROS's own generators, in a virtual environment beside the build, and has the
-type hash of the original: it talks to any other ROS. ``make tf2_msgs`` installs it into ``.venv``. Needs a C and C++
-compiler and CMake.
+ROS's own generators make it from its one message, in a temporary virtual environment. It has the type hash of the original,
+so it communicates with any other ROS 2 Jazzy. ``make tf2_msgs`` installs it into ``.venv``. Needs a C and C++ compiler and
+CMake.
 """
 
 from __future__ import annotations
@@ -50,16 +50,16 @@ rosidl_generate_interfaces(${PROJECT_NAME} msg/TFMessage.msg DEPENDENCIES geomet
 ament_package()
 """,
 }
-# The wheels' CMake files name the folders of the machine they were built on.
+# The CMake files in the wheels contain paths of the machine that built them.
 NUMPY_THERE = re.compile(r'/opt/python/cp3\d+-cp3\d+/lib/python3\.\d+/site-packages/numpy/_core/include')
 PYTHON_THERE = re.compile(r'/opt/python/cp3\d+-cp3\d+/include/python3\.\d+')
 
 
 def build(prefix: Path) -> None:
-    """Build and install below a prefix; the package is then in the prefix's ``site-packages`` and ``lib``.
+    """Build and install below a prefix, in its ``site-packages`` and ``lib``.
 
     Raises:
-        CalledProcessError: a step failed; what it said went to stderr.
+        CalledProcessError: a step failed; its output went to stderr.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -71,7 +71,7 @@ def build(prefix: Path) -> None:
 
 
 def make_environment(folder: Path) -> Path:
-    """A virtual environment with the generators; its Python."""
+    """Create a virtual environment with the generators. Returns the path of its Python."""
     venv.create(folder, with_pip=True)
     python = folder / 'bin' / 'python'
     run(python, '-m', 'pip', 'install', '--quiet', '-c', ROOT / 'constraints.txt', *GENERATORS)
@@ -91,7 +91,7 @@ def cmake(folder: Path, python: Path, prefix: Path) -> None:
         **os.environ,
         'PATH': f'{python.parent}:{os.environ["PATH"]}', 'AMENT_PREFIX_PATH': str(root), 'CMAKE_PREFIX_PATH': str(root),
     }  # fmt: skip
-    # The bootstrap of the wheels' libraries has run in this process for another environment, perhaps.
+    # The wheels set these for another environment, if rclpy was imported in this process or a parent.
     for variable in ('_ROS_WHEELS_BOOTSTRAP_COMPLETE', 'LD_LIBRARY_PATH', 'PYTHONPATH'):
         environment.pop(variable, None)
     options = {
@@ -105,7 +105,7 @@ def cmake(folder: Path, python: Path, prefix: Path) -> None:
 
 
 def run(*command: str | Path, environment: Mapping[str, str] | None = None) -> None:
-    """Run a command; what it says is shown only if it fails."""
+    """Run a command. Its output is shown only if it fails."""
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:
         sys.stderr.write(done.stdout + done.stderr)
@@ -113,18 +113,18 @@ def run(*command: str | Path, environment: Mapping[str, str] | None = None) -> N
 
 
 def output(*command: str | Path) -> str:
-    """What a command prints."""
+    """Returns the output of a command."""
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Build; returns the exit code."""
-    parser = argparse.ArgumentParser(description='Build tf2_msgs for this Python, where ROS comes from pip.')
+    """Build. Returns the exit code."""
+    parser = argparse.ArgumentParser(description='Build tf2_msgs for this Python, for a ROS installed by pip.')
     parser.add_argument('prefix', metavar='PREFIX', type=Path, help='where to install, for example .venv')
     try:
         build(parser.parse_args(arguments).prefix.resolve())
     except (OSError, subprocess.CalledProcessError) as error:
-        print(f'tf2_msgs: {error}: needs a network, gcc, g++ and cmake', file=sys.stderr)
+        print(f'tf2_msgs: {error}: the build needs a network, gcc, g++ and cmake', file=sys.stderr)
         return 1
     return 0
 
