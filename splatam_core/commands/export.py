@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from splatam_core.commands.shared import Command, add_run_argument, open_run, open_source, positive, progress
 from splatam_core.errors import ExportError
@@ -107,7 +107,7 @@ def _write_splatam(path: Path, run: RunRecord, gaussians: Gaussians) -> None:
     poses = run.trajectory.T_world_cam
     tracked = [frame for frame in run.frames if frame.status is not Status.LOST]
     keyframes = [index for index, frame in enumerate(tracked) if frame.is_keyframe]
-    arrays = splatam_params(gaussians, run.camera_or_error(), poses, keyframes, _true_poses(run))
+    arrays: dict[str, Any] = splatam_params(gaussians, run.camera_or_error(), poses, keyframes, _true_poses(run))
     with replaced(path) as temporary, temporary.open('wb') as file:
         np.savez(file, **arrays)
 
