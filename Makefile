@@ -48,13 +48,12 @@ $(VENV)/.native: $(CSRC) setup.py package.xml constraints.txt | $(VENV)/.created
 
 $(VENV)/.installed: setup.py setup.cfg package.xml pyproject.toml constraints.txt | $(VENV)/.native
 	@echo 'installing the requirements of splatam_ros into $(VENV): some minutes the first time'
-	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[ros,test]'
+	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[ros,test,lint]'
 	touch $@
 
-# The tools of `make lint`, `make docs` and `make hooks`.
-$(VENV)/.tools: setup.py constraints.txt docs/requirements.txt | $(VENV)/.installed
-	@echo 'installing the tools for lint and docs into $(VENV)'
-	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[lint]' -r docs/requirements.txt
+# mypy needs MkDocs too, to check the hook of the documentation site.
+$(VENV)/.docs: docs/requirements.txt constraints.txt | $(VENV)/.installed
+	@$(BIN)/python -m pip install --quiet -c constraints.txt -r docs/requirements.txt
 	touch $@
 
 # ROS from pip has no tf2_msgs. An installed ROS has it already.
@@ -71,7 +70,7 @@ test-quick: setup
 	@$(BIN)/python -m pytest -q -n $(TEST_WORKERS) --dist worksteal -m 'not slow and not ros and not recording'
 
 # Runs every check, also after one has failed, and names those that failed.
-lint: $(VENV)/.tools
+lint: setup $(VENV)/.docs
 	@failed=()
 	check() { echo "== $$*"; "$(BIN)/$$1" "$${@:2}" || failed+=("$$1 $$2"); }
 	check ruff check --quiet .
@@ -81,15 +80,15 @@ lint: $(VENV)/.tools
 	check clang-format --dry-run --Werror $(CSRC)
 	if (( $${#failed[@]} )); then printf 'make lint: failed: %s\n' "$$(IFS=,; echo "$${failed[*]}")" >&2; exit 1; fi
 
-format: $(VENV)/.tools
+format: setup
 	@$(BIN)/ruff check --quiet --fix .
 	$(BIN)/ruff format --quiet .
 	$(BIN)/clang-format -i $(CSRC)
 
-docs: $(VENV)/.tools
+docs: setup $(VENV)/.docs
 	@$(BIN)/python -m mkdocs build --strict --quiet
 
-hooks: $(VENV)/.tools
+hooks: setup $(VENV)/.docs
 	@$(BIN)/pre-commit install
 
 demo: setup

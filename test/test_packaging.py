@@ -1,4 +1,4 @@
-"""What is installed: one version, every file, three commands; and one line where something is missing."""
+"""Packaging: one version, every file, three commands, and an error of one line if something is missing."""
 
 from __future__ import annotations
 
@@ -40,9 +40,24 @@ def files_below(folder: Path, pattern: str = '*') -> set[Path]:
 
 def test_the_version_is_stated_once_and_is_the_installed_one() -> None:
     version = ElementTree.parse(ROOT / 'package.xml').findtext('version')
-    assert metadata.version(NAME) == version
+    assert metadata.version(NAME) == version, 'installed is another version: make setup'
+    assert run_setup('--version').stdout.strip() == version
     for path in ('setup.py', 'setup.cfg', 'pyproject.toml', 'splatam_core/__init__.py'):
         assert version not in (ROOT / path).read_text(), f'{path} states the version again'
+
+
+def test_the_newest_release_of_the_changelog_is_the_version() -> None:
+    """A section ``Forthcoming`` may be above it."""
+    version = ElementTree.parse(ROOT / 'package.xml').findtext('version')
+    headings = re.findall(r'^(\d+\.\d+\.\d+) \(\d{4}-\d\d-\d\d\)\n-+$', (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE)
+    assert headings and headings[0] == version
+
+
+def test_every_make_target_is_in_its_help() -> None:
+    makefile = (ROOT / 'Makefile').read_text()
+    targets = set(re.search(r'^\.PHONY: (.*)$', makefile, re.MULTILINE).group(1).split())
+    shown = subprocess.run(['make', '--no-print-directory', 'help'], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert set(re.findall(r'^make (\S+)', shown, re.MULTILINE)) == targets - {'help'}
 
 
 def test_the_commands_can_be_loaded() -> None:
