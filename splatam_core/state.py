@@ -1,4 +1,4 @@
-"""The state of SLAM that outlives a frame: what a checkpoint stores and ``Slam.restore`` takes back."""
+"""The state of SLAM between two frames: ``Slam.state`` returns it, a checkpoint stores it, ``Slam.restore`` takes it."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from splatam_core.types import Arrays
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlamState:
-    """All of ``Slam`` that the frames to come depend on.
+    """Everything in ``Slam`` that later frames depend on.
 
     Attributes:
         config: every setting.
         camera: of the frames; None before the first.
         map: see ``GaussianMap.arrays``.
-        keyframes: as they were kept, in the host's memory.
+        keyframes: at the size they are fitted at, in the host's memory.
         motion: of the motion model.
-        rng: of numpy's generator, as ``BitGenerator.state`` has it.
+        rng: of numpy's generator, in the form of ``BitGenerator.state``.
         scene_radius: metres; 0 before the first frame.
-        num_frames: frames processed.
-        last_stamp_ns: stamp of the last one; None where the next may have any.
+        num_frames: number of frames processed.
+        last_stamp_ns: stamp of the last frame; None where the next frame may have any stamp.
     """
 
     config: SlamConfig
