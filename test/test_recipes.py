@@ -64,6 +64,13 @@ def test_every_rasterizer_can_be_chosen() -> None:
     assert set(rasterizer._BACKENDS) == choices('rasterizer') - {'auto'}
 
 
+def test_every_rasterizer_is_held_to_the_contract() -> None:
+    """Against the reference, which defines the contract."""
+    text = (ROOT / 'test' / 'core' / 'test_rasterizer_contract.py').read_text()
+    held = re.search(r'^BACKENDS = (\[.*?\])$', text, re.MULTILINE | re.DOTALL)
+    assert held and {name for name, _ in ast.literal_eval(held[1])} | {'reference'} == set(rasterizer._BACKENDS)
+
+
 # --- a dataset reader ---
 
 
