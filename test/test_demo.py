@@ -8,10 +8,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from domains import reserve_domain
 
 from splatam_ros.demo import require_replaceable
 
@@ -46,6 +47,15 @@ def wait_until(condition: Callable[[], bool]) -> None:
     while not condition():
         assert time.monotonic() < deadline, 'timed out'
         time.sleep(0.1)
+
+
+@pytest.fixture(autouse=True)
+def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A ROS domain that no other test uses meanwhile."""
+    number, reservation = reserve_domain()
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(number))
+    with reservation:
+        yield
 
 
 @pytest.fixture

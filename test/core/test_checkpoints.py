@@ -133,6 +133,7 @@ def killed_after(frames: int, words: list[str]) -> None:
 # --- going on ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('preset', PRESETS)
 def test_a_run_that_was_killed_ends_as_if_it_had_not_been(preset: str, whole: dict[str, Path], tmp_path: Path) -> None:
     killed_after(5, arguments(preset, tmp_path / 'run', '--checkpoint-every', EVERY))
@@ -151,6 +152,7 @@ def test_writing_checkpoints_changes_nothing(whole: dict[str, Path], tmp_path: P
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_time_and_again(whole: dict[str, Path], tmp_path: Path) -> None:
     killed_after(4, arguments('quick', tmp_path / 'run', '--checkpoint-every', 2, '--keep-checkpoints', 1))
     killed_after(7, ['run', '--resume', str(tmp_path / 'run'), '--no-evaluate'])
@@ -181,6 +183,7 @@ def test_ctrl_c_saves_a_checkpoint_of_the_last_frame(
     assert result(tmp_path / 'run') == result(whole['quick'])
 
 
+@pytest.mark.slow
 def test_a_run_from_a_gpu_goes_on_without_one(
     run: Path, whole: dict[str, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -280,6 +283,7 @@ def test_only_the_last_ones_are_kept(state: SlamState, tmp_path: Path) -> None:
     assert read_newest(tmp_path).progress.num_lines == 1_000_001
 
 
+@pytest.mark.slow
 def test_a_process_killed_while_saving_leaves_the_checkpoint_before(state: SlamState, tmp_path: Path) -> None:
     """At every place where it waits for the disk, as the file's bytes are written but it has no name yet."""
     path = Checkpoints(tmp_path, 1).save(state, PROGRESS)
@@ -313,6 +317,7 @@ def test_a_process_killed_while_saving_leaves_the_checkpoint_before(state: SlamS
     assert not list(tmp_path.rglob('.*')), 'what the killed ones left is still there'
 
 
+@pytest.mark.slow
 def test_a_process_killed_anywhere_while_saving_leaves_a_checkpoint(state: SlamState, tmp_path: Path) -> None:
     Checkpoints(tmp_path, 2).save(state, PROGRESS)
     code = """

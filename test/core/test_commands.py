@@ -90,6 +90,7 @@ def replica_v2(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_test_split_is_scored_at_its_true_poses(replica_v2: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert splatam('run', replica_v2, '--preset', 'quick', *FAST, '--no-evaluate', '--out', tmp_path / 'run') == 0
     assert splatam('evaluate', tmp_path / 'run', '--novel-views') == 0
@@ -144,6 +145,7 @@ def test_compare_refuses_what_it_cannot_draw(
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_bench_runs_presets_and_compares_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -241,6 +243,7 @@ def test_refine_makes_a_better_map_and_leaves_the_run_alone(
     assert {path.name for path in (tmp_path / 'refined').iterdir()} == set(before)
 
 
+@pytest.mark.slow
 def test_refine_may_add_gaussians(run: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr('splatam_core.mapping.offline_refinement.DENSIFY_FROM', 20)
     monkeypatch.setattr('splatam_core.mapping.offline_refinement.DENSIFY_EVERY', 20)

@@ -114,10 +114,11 @@ def test_walk_is_smooth_stays_inside_and_comes_back():
     assert np.degrees(np.ptp(yaws)) > 60  # it looks around
 
 
+@pytest.mark.slow
 def test_fast_walk_needs_prediction_and_shows_new_ground():
     """Out of reach of the paper's tracking steps from the last pose, well within it from a constant velocity."""
     config = load_config('splatam').tracking
-    reach = 2 * config.iterations * config.rotation_rate  # radians: Adam moves each half-angle by its rate a step
+    reach = 2 * config.iterations * config.paper.rotation_rate  # radians: Adam moves each half-angle by its rate a step
     walks = [SyntheticSequence(frames=240, width=32, motion=motion, seed=seed) for motion in MOTIONS for seed in (0, 1, 2)]
     for sequence in walks:
         truth = sequence.ground_truth().T_world_cam
@@ -126,7 +127,7 @@ def test_fast_walk_needs_prediction_and_shows_new_ground():
         assert ((turned > reach).mean() > 0.6) == (sequence._walk.motion == 'fast')
         assert turned[0] < reach  # the first step is nobody's to predict
         assert surprise.max() < 0.3 * reach
-        assert np.linalg.norm(np.diff(steps[:, :3], axis=0), axis=1).max() < 0.3 * config.iterations * config.translation_rate
+        assert np.linalg.norm(np.diff(steps[:, :3], axis=0), axis=1).max() < 0.3 * config.iterations * config.paper.translation_rate
         assert np.all(np.abs(truth[:, :3, 3]) < np.array([0.8, 0.8, 1.6]))
     back = se3.log(se3.inverse(truth[0]) @ truth[120])
     assert np.linalg.norm(back[:3]) < 0.03

@@ -160,6 +160,7 @@ def test_bounds_grow_with_what_is_fitted() -> None:
     assert (bounds[:3] <= before[0, :3]).all() and (bounds[3:] >= before[0, 3:]).all() and not torch.equal(bounds, before[0])
 
 
+@pytest.mark.slow
 def test_ten_frames_find_the_poses_of_the_cpu(room: Callable[..., SyntheticSequence]) -> None:
     """The whole of ``Slam.process``, the paper's way: from the same state poses agree within 0.2 mm, as GPUs are to.
 
@@ -279,6 +280,7 @@ LAUNCHED = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('target', 'binary'), [('cuda 80 32', 'cubin'), ('hip gfx942 64', 'hsaco')])
 def test_the_compiler_takes_every_kernel(target: str, binary: str, tmp_path: Path) -> None:
     """Ahead of time, to machine code of a card of either maker, without a card: the interpreter takes more than the compiler."""

@@ -33,6 +33,7 @@ def _config(rasterizer: str) -> SlamConfig:
     return load_config('realtime', ['threads=1', f'rasterizer={rasterizer}', *FEW_STEPS])
 
 
+@pytest.mark.slow
 def test_ten_frames_of_realtime_are_those_of_the_native_rasterizer(room: Room) -> None:
     """Each from the same state, which moves between the two without loss: the same frames tracked, as many Gaussians."""
     sequence = room(10, WIDTH, noise=False)

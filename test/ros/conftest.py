@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import importlib
 import os
 import subprocess
@@ -38,9 +39,12 @@ def tf2_prefix() -> Path | None:
     """Where tf2_msgs was built for tests; None where it is installed. ``make test`` installs it, into .venv."""
     if find_spec('tf2_msgs') is not None:
         return None
-    if not (TF2_PREFIX / 'share' / 'tf2_msgs').is_dir():
-        built = subprocess.run([sys.executable, ROOT / 'tools' / 'tf2_msgs.py', TF2_PREFIX], check=False)
-        assert built.returncode == 0, 'tf2_msgs cannot be built; apt install ros-jazzy-tf2-msgs, or see above'
+    tool = ROOT / 'tools' / 'tf2_msgs.py'
+    with tool.open('rb') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # another test process may be building it
+        if not (TF2_PREFIX / 'share' / 'tf2_msgs').is_dir():
+            built = subprocess.run([sys.executable, tool, TF2_PREFIX], check=False)
+            assert built.returncode == 0, 'tf2_msgs cannot be built; apt install ros-jazzy-tf2-msgs, or see above'
     return TF2_PREFIX
 
 

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import fcntl
-import itertools
 import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import rclpy
+from domains import reserve_domain
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -25,8 +23,6 @@ from splatam_core.resources import config_dir
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT_S = 60.0  # only ever waited out when a test fails; two busy cores make everything slow
-NUM_DOMAINS = 101  # above, the ports may belong to somebody else
-CANDIDATES = itertools.count(os.getpid())
 RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 
 
@@ -39,22 +35,6 @@ def environment(domain: int, log_folder: Path) -> dict[str, str]:
         'ROS_LOG_DIR': str(log_folder),
         'PYTHONUNBUFFERED': '1',
     }
-
-
-def reserve_domain() -> tuple[int, IO[bytes]]:
-    """A domain that no other test run on this machine uses, for as long as the file stays open."""
-    folder = Path(tempfile.gettempdir()) / 'splatam_ros_test_domains'
-    folder.mkdir(exist_ok=True)
-    for candidate in itertools.islice(CANDIDATES, NUM_DOMAINS):
-        domain = 1 + candidate % NUM_DOMAINS
-        file = (folder / str(domain)).open('wb')
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.close()
-        else:
-            return domain, file
-    raise AssertionError('all ROS domains are in use by tests')
 
 
 class Process:
