@@ -1,11 +1,13 @@
-"""A hook of MkDocs: makes README.md and CONTRIBUTING.md pages of the documentation site.
+"""A hook of MkDocs: pages of the documentation site that are not files in docs/.
 
-The two files stay where GitHub and ROS expect them. Here their links are rewritten from the repository's root to the docs
-folder, so that ``mkdocs build --strict`` checks them like all others.
+README.md and CONTRIBUTING.md stay where GitHub and ROS expect them. Here their links are rewritten from the repository's root
+to the docs folder, so that ``mkdocs build --strict`` checks them like all others. The table of settings comes from
+``splatam_core.config``, which imports neither torch nor ROS.
 """
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,21 +16,46 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {'README.md': 'index.md', 'CONTRIBUTING.md': 'contributing.md'}
+SETTINGS = 'settings.md'
+SETTINGS_HEAD = """# All settings
+
+Change a setting with `--set NAME=VALUE` on the command line, or as the ROS parameter `slam.NAME`. [Presets](presets.md) change
+several at once. The defaults are the paper's for Replica.
+"""
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages."""
+    """Adds the pages."""
     for source, page in PAGES.items():
         files.append(File.generated(config, page, content=_from_root((ROOT / source).read_text())))
+    files.append(File.generated(config, SETTINGS, content=settings_page()))
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: object) -> str:
-    """Point links from docs pages to the root's files at the pages made of them."""
+    """Points links to the root's files at the pages made of them."""
     depth = page.file.src_uri.count('/')
     for source, target in PAGES.items():
         markdown = markdown.replace(f']({"../" * (depth + 1)}{source}', f']({"../" * depth}{target}')
     return markdown
+
+
+def settings_page() -> str:
+    """Returns a table of every SLAM setting, a section each."""
+    sys.path.insert(0, str(ROOT))
+    from splatam_core.config import settings
+
+    lines, section = [SETTINGS_HEAD], None
+    for setting in settings():
+        path, _, name = setting.name.rpartition('.')
+        if path != section:
+            section = path
+            lines += ['', f'## {path or "General"}', '', '| setting | default | allowed | what it does |', '|---|---|---|---|']
+        default = str(setting.default).lower() if isinstance(setting.default, bool) else setting.default
+        bounds = [f'{sign} {bound:g}' for sign, bound in (('≥', setting.minimum), ('≤', setting.maximum)) if bound is not None]
+        kind = ', '.join(setting.choices) or ' '.join([setting.type.__name__, ', '.join(bounds), setting.unit]).strip()
+        lines.append(f'| `{name}` | `{default}` | {kind} | {setting.help} |')
+    return '\n'.join(lines) + '\n'
 
 
 def _from_root(markdown: str) -> str:
