@@ -120,11 +120,12 @@ setup(
         'Topic :: Scientific/Engineering :: Image Processing',
     ],
     install_requires=[
+        'jinja2>=3.1',
         'matplotlib>=3.6',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
         'pyyaml>=5.4',
-        'rosbags>=0.11.7',
+        'rosbags>=0.11.7,<0.12',
         'torch>=2.2',
         'tqdm>=4.60',
     ],
