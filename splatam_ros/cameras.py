@@ -40,7 +40,7 @@ CAMERAS: Mapping[str, CameraTopics] = {
         '/camera/camera/color/image_raw',
         '/camera/camera/aligned_depth_to_color/image_raw',
         '/camera/camera/color/camera_info',
-        "rgb8, 16UC1 in mm; aligned depth has the stamp of its colour image",
+        'rgb8, 16UC1 in mm; aligned depth has the stamp of its colour image',
         'https://github.com/IntelRealSense/realsense-ros',
     ),
     'azure_kinect': CameraTopics(
@@ -49,7 +49,7 @@ CAMERAS: Mapping[str, CameraTopics] = {
         '/rgb/image_raw',
         '/depth_to_rgb/image_raw',
         '/rgb/camera_info',
-        'bgra8, 32FC1 in m or 16UC1 in mm; not undistorted: colour and registered depth have the same distortion (rational_polynomial)',
+        'bgra8, 32FC1 in m or 16UC1 in mm; not undistorted: colour and depth have the same distortion (rational_polynomial)',
         'https://github.com/microsoft/Azure_Kinect_ROS_Driver/blob/melodic/docs/usage.md',
     ),
     'orbbec': CameraTopics(
@@ -86,7 +86,7 @@ CAMERAS: Mapping[str, CameraTopics] = {
         '/camera/rgb/image_color',
         '/camera/depth/image',
         '/camera/rgb/camera_info',
-        'rgb8, 32FC1 in m; registered; the stamps of colour and depth differ by up to half a frame period, and so do their frame ids',
+        'rgb8, 32FC1 in m; registered; stamps of colour and depth differ by up to half a frame period; their frame ids differ',
         'https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats',
     ),
 }

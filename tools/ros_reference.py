@@ -1,9 +1,9 @@
-"""Writes the tables of docs/ros.md from the code, or with ``--check`` says whether they are stale.
+"""Writes the tables of docs/ros.md from the code. With ``--check`` only reports whether they are out of date.
 
 Run as ``python tools/ros_reference.py``. Everything between ``<!-- generated: NAME -->`` and ``<!-- end -->`` is
-replaced by what ``SECTIONS[NAME]`` returns; the text around it is written by hand. A new kind of table (services, say)
-is a function that returns Markdown, a line in ``SECTIONS``, and the two markers in docs/ros.md.
-``test/ros/test_reference.py`` fails when the file is stale, and holds the tables against a running node.
+replaced by what ``SECTIONS[NAME]`` returns; the text around it is written by hand. To add a table, write a function that
+returns Markdown, and add a line to ``SECTIONS`` and the two markers to docs/ros.md.
+``test/ros/test_reference.py`` fails if the page is out of date; ``test_outputs.py`` compares its topics with a running node.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 import yaml
 
-from splatam_core.config import Setting
+from splatam_core.settings import Setting
 from splatam_ros import interface
 from splatam_ros.cameras import CAMERAS
 from splatam_ros.node.outputs import OUTPUTS
@@ -32,25 +32,25 @@ SECTION = re.compile(r'(<!-- generated: (\w+) -->\n).*?(<!-- end -->)', re.DOTAL
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
+    """Returns a Markdown table."""
     lines = [head, ['---'] * len(head), *rows]
     return ''.join(f'| {" | ".join(cell.replace("|", chr(92) + "|") for cell in line)} |\n' for line in lines)
 
 
 def inputs() -> str:
-    """What the node subscribes to."""
+    """Returns the table of subscribed topics."""
     return table(('topic', 'type', ''), ((f'`{topic.name}`', topic.type_name, topic.help) for topic in interface.INPUTS))
 
 
 def outputs() -> str:
-    """What the node publishes."""
+    """Returns the table of published topics."""
     own = [(f'`~/{output.topic}`', output.type_name, output.trigger.value, output.help) for output in OUTPUTS]
     shared = [(f'`{topic.name}`', topic.type_name, topic.when, topic.help) for topic in interface.OUTPUTS]
     return table(('topic', 'type', 'when', ''), [*own, *shared])
 
 
 def parameters() -> str:
-    """The node's own parameters."""
+    """Returns the table of the node's own parameters."""
     return table(('parameter', 'default', 'allowed', 'at run time', ''), map(_parameter, NODE_SETTINGS))
 
 
@@ -69,12 +69,12 @@ def _allowed(setting: Setting) -> str:
 
 
 def frames() -> str:
-    """The coordinate frames."""
+    """Returns the table of coordinate frames."""
     return table(('frame', 'parameter', ''), ((f.default, f'`{f.parameter}`', f.help) for f in interface.FRAMES))
 
 
 def features() -> str:
-    """What users expect of an RGB-D SLAM node, and the tests that show it."""
+    """Returns the table of features, with the tests that show them."""
     return table(('feature', 'level', 'shown by'), map(_feature, yaml.safe_load(FEATURES.read_text())))
 
 
@@ -83,7 +83,7 @@ def _feature(row: dict[str, Any]) -> Sequence[str]:
 
 
 def faults() -> str:
-    """What happens when something fails, and the tests that show it."""
+    """Returns the table of faults and reactions, with the tests that show them."""
     rows = yaml.safe_load(FAULTS.read_text())
     return table(('fault', 'what happens', 'shown by'), ((row['fault'], row['happens'], _shown(row)) for row in rows))
 
@@ -95,12 +95,12 @@ def _shown(row: dict[str, Any]) -> str:
 
 
 def services() -> str:
-    """What can be asked of the node."""
+    """Returns the table of services."""
     return table(('service', ''), ((f'`~/{service.name}`', service.help) for service in SERVICES))
 
 
 def cameras() -> str:
-    """Cameras whose topics are known."""
+    """Returns the table of cameras."""
     return table(
         ('`camera:=`', '', 'driver', 'colour, depth, camera info', ''),
         (
@@ -123,7 +123,7 @@ SECTIONS: dict[str, Callable[[], str]] = {
 
 
 def generate(text: str) -> str:
-    """The page with its tables made anew.
+    """Returns the page with new tables.
 
     Raises:
         ValueError: a section is unknown, or one is missing.
@@ -135,15 +135,15 @@ def generate(text: str) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the page, or check it; returns the exit code."""
+    """Write the page, or check it. Returns the exit code."""
     parser = argparse.ArgumentParser(description='Write the tables of docs/ros.md from the code.')
-    parser.add_argument('--check', action='store_true', help='change nothing; exit code 1 if the tables are stale')
+    parser.add_argument('--check', action='store_true', help='change nothing; exit with 1 if the tables are out of date')
     check = parser.parse_args(arguments).check
     before = PAGE.read_text()
     after = generate(before)
     if check:
         if before != after:
-            print(f'{PAGE.relative_to(ROOT)} is stale: run python tools/ros_reference.py', file=sys.stderr)
+            print(f'{PAGE.relative_to(ROOT)} is out of date: run python tools/ros_reference.py', file=sys.stderr)
         return int(before != after)
     PAGE.write_text(after)
     return 0

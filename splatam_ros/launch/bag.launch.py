@@ -1,4 +1,4 @@
-"""Play a recording into the node as fast as SLAM can follow; when it is over, save and end.
+"""Play a recording into the node as fast as SLAM allows; save and exit at its end.
 
 ros2 launch splatam_ros bag.launch.py bag:=/path/to/recording save_path:=out/run
 """
@@ -15,17 +15,17 @@ from launch_ros.substitutions import FindPackageShare
 DEFAULT_PARAMETERS = PathJoinSubstitution([FindPackageShare('splatam_ros'), 'config', 'ros', 'node.yaml'])
 ARGUMENTS = (
     ('rgb', '/rgb/image', 'colour topic of the recording'),
-    ('depth', '/depth/image', 'its depth topic, registered to colour'),
-    ('info', '/rgb/camera_info', 'its camera info of the colour camera'),
-    ('rate', 'max', "speed; 'max' is as fast as SLAM can follow"),
+    ('depth', '/depth/image', 'depth topic of the recording, registered to colour'),
+    ('info', '/rgb/camera_info', 'camera info topic of the recording, of the colour camera'),
+    ('rate', 'max', "playback rate; 'max' = as fast as SLAM allows"),
     ('params_file', DEFAULT_PARAMETERS, 'parameter file'),
-    ('preset', 'quick', 'SLAM preset: the name of a shipped one, or a .yaml file'),
-    ('save_path', '', 'folder for trajectory, map and metrics; empty: nothing is saved'),
+    ('preset', 'quick', 'SLAM preset: name of a shipped preset, or path of a .yaml file'),
+    ('save_path', '', 'folder for trajectory, map and metrics; empty = save nothing'),
 )
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The node, which keeps every frame and ends with the recording, and the player."""
+    """Returns the player and the node, which processes every frame and exits at the end of the recording."""
     value = {name: LaunchConfiguration(name) for name, _, _ in ARGUMENTS}
     node = Node(
         package='splatam_ros',

@@ -1,4 +1,4 @@
-"""Start the node beside a camera whose driver is running.
+"""Start the node for a camera whose driver is running.
 
 ros2 launch splatam_ros camera.launch.py camera:=realsense save_path:=out/office
 """
@@ -16,14 +16,14 @@ from splatam_ros.cameras import CAMERAS
 
 ARGUMENTS = (
     ('camera', 'realsense', 'one of ' + ', '.join(CAMERAS)),
-    ('preset', 'quick', 'SLAM preset: the name of a shipped one, or a .yaml file'),
-    ('save_path', '', 'folder for trajectory, map and metrics; empty: nothing is saved'),
-    ('load_path', '', 'map to start in'),
+    ('preset', 'quick', 'SLAM preset: name of a shipped preset, or path of a .yaml file'),
+    ('save_path', '', 'folder for trajectory, map and metrics; empty = save nothing'),
+    ('load_path', '', 'map to load at start; empty = start a new map'),
 )
 
 
 def start(context: LaunchContext) -> list[Node]:
-    """The node, on the topics of the camera that was chosen."""
+    """Returns the node, on the topics of the chosen camera."""
     name = LaunchConfiguration('camera').perform(context)
     if name not in CAMERAS:
         raise ValueError(f"camera '{name}': expected one of {', '.join(CAMERAS)}")
@@ -43,7 +43,7 @@ def start(context: LaunchContext) -> list[Node]:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The node, once the camera's name is known."""
+    """Returns the arguments, and the node as soon as the name of the camera is known."""
     arguments = [
         DeclareLaunchArgument(name, default_value=default, description=description) for name, default, description in ARGUMENTS
     ]

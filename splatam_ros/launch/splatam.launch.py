@@ -1,4 +1,4 @@
-"""Start the node, every topic remapped as asked for.
+"""Start the node with an argument for every topic.
 
 ros2 launch splatam_ros splatam.launch.py rgb:=/color depth:=/depth info:=/info namespace:=/robot
 """
@@ -17,19 +17,19 @@ ARGUMENTS = (
     ('rgb', 'rgb/image', 'colour topic'),
     ('depth', 'depth/image', 'depth topic, registered to colour'),
     ('info', 'rgb/camera_info', 'camera info of the colour camera'),
-    ('odom', 'odom', 'odometry topic, with odom.source topic'),
+    ('odom', 'odom', 'odometry topic; used with odom.source topic'),
     ('name', 'splatam', 'name of the node'),
     ('namespace', '', 'namespace of the node'),
     ('params_file', DEFAULT_PARAMETERS, 'parameter file'),
-    ('preset', 'quick', 'SLAM preset: the name of a shipped one, or a .yaml file'),
-    ('save_path', '', 'folder for trajectory, map and metrics; empty: nothing is saved'),
-    ('load_path', '', 'map to start in'),
-    ('use_sim_time', 'false', 'take the time from /clock'),
+    ('preset', 'quick', 'SLAM preset: name of a shipped preset, or path of a .yaml file'),
+    ('save_path', '', 'folder for trajectory, map and metrics; empty = save nothing'),
+    ('load_path', '', 'map to load at start; empty = start a new map'),
+    ('use_sim_time', 'false', 'use the time of /clock'),
 )
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The node; when it ends, so does everything that was launched with it."""
+    """Returns the node; when it exits, everything launched with it is shut down."""
     value = {name: LaunchConfiguration(name) for name, _, _ in ARGUMENTS}
     node = Node(
         package='splatam_ros',

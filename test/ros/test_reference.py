@@ -1,4 +1,4 @@
-"""docs/ros.md says what the code says, and every feature it claims is shown by a test that exists."""
+"""docs/ros.md is up to date with the code, and every test that it names exists."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_stale_page_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     page.write_text(TOOL.PAGE.read_text().replace('`queue_size`', '`queue_length`'))
     monkeypatch.setattr(TOOL, 'PAGE', page)
     monkeypatch.setattr(TOOL, 'ROOT', tmp_path)
-    assert TOOL.main(['--check']) == 1 and 'stale' in capsys.readouterr().err
+    assert TOOL.main(['--check']) == 1 and 'out of date' in capsys.readouterr().err
     assert TOOL.main([]) == 0 and TOOL.main(['--check']) == 0
 
 
