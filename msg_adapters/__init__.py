@@ -1,1 +1,1 @@
-"""ROS messages to numpy and back: pure functions, no rclpy, no SLAM."""
+"""Converts ROS messages to numpy and back: pure functions, no rclpy, no SLAM."""

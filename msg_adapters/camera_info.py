@@ -1,4 +1,4 @@
-"""``sensor_msgs/CameraInfo``: the camera of the image as it was sent, binned and cropped.
+"""Reads and makes ``sensor_msgs/CameraInfo``: the camera of the image as it was sent, binned and cropped.
 
 A pixel's centre is its integer index: cropping subtracts the offset, binning by ``b`` maps
 ``f' = f / b`` and ``c' = (c + 0.5) / b - 0.5``.
@@ -16,14 +16,14 @@ from msg_adapters import stamps
 from msg_adapters.errors import MessageError
 from msg_adapters.factory import MessageFactory
 
-# Number of coefficients by model; fewer mean that the others are zero.
+# Number of coefficients of each model; missing ones are zero.
 COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 _NO_DISTORTION = ('', 'none', 'pinhole')
 
 
 @dataclass(frozen=True, slots=True)
 class CameraParameters:
-    """What a CameraInfo says about the image it belongs to.
+    """What a CameraInfo states about its image.
 
     Attributes:
         width, height: size of the image in pixels, after binning and cropping.
@@ -46,31 +46,34 @@ class CameraParameters:
 
 
 def parameters(message: Any, *, is_rectified: bool = False) -> CameraParameters:
-    """Read a ``sensor_msgs/CameraInfo``; K and D are used, binning and region of interest applied.
+    """Read a ``sensor_msgs/CameraInfo``: K and D, after binning and cropping to the region of interest.
 
-    Of images that are rectified already (``image_rect``), P is the camera; K and D are what it was before.
+    For images that are already rectified (``image_rect``), P is the camera; K and D describe the raw images.
 
-    A model whose coefficients are all zero is 'none'. That holds for 'equidistant' too: an info like
-    that comes with rectified images, no calibration finds exact zeros.
+    A model whose coefficients are all zero is 'none'. This includes 'equidistant': exact zeros do not come from a
+    calibration, but from a driver that publishes rectified images.
 
     Args:
         message: the CameraInfo.
-        is_rectified: whether the images it comes with are rectified.
+        is_rectified: True if its images are rectified.
 
     Raises:
-        MessageError: K, or the P of rectified images, is not calibrated, the size is zero, the distortion model is
+        MessageError: K (or P, for rectified images) is not calibrated, the size is zero, the distortion model is
             unknown or has too many coefficients, or the region of interest is not within the image.
     """
     fx, cx, fy, cy = _intrinsics('P', message.p, 4) if is_rectified else _intrinsics('K', message.k, 3)
     model, coefficients = ('none', ()) if is_rectified else _distortion(message)
-    full = CameraParameters(int(message.width), int(message.height), fx, fy, cx, cy, model, coefficients, message.header.frame_id)
+    full = CameraParameters(
+        width=int(message.width), height=int(message.height), fx=fx, fy=fy, cx=cx, cy=cy,
+        distortion_model=model, distortion=coefficients, frame_id=message.header.frame_id,
+    )  # fmt: skip
     if full.width < 1 or full.height < 1:
-        raise MessageError(f'CameraInfo says the image is {full.width}x{full.height}; fill in width and height')
+        raise MessageError(f'CameraInfo states that the image is {full.width}x{full.height}; fill in width and height')
     return _binned(_cropped(full, message.roi), int(message.binning_x), int(message.binning_y))
 
 
-def _intrinsics(name: str, matrix: Sequence[float], columns: int) -> tuple[float, float, float, float]:
-    """fx, cx, fy, cy of a matrix given row by row."""
+def _intrinsics(name: str, matrix: Sequence[float], columns: int) -> list[float]:
+    """Returns fx, cx, fy, cy of a matrix given row by row, checked."""
     values = [float(value) for value in matrix]
     fx, cx, fy, cy = values[0], values[2], values[columns + 1], values[columns + 2]
     if not (np.isfinite(values).all() and fx > 0 and fy > 0):
@@ -78,7 +81,7 @@ def _intrinsics(name: str, matrix: Sequence[float], columns: int) -> tuple[float
             f'CameraInfo {name} = {values}: focal lengths must be positive and all values finite; '
             'the camera is not calibrated, or its driver does not publish the calibration'
         )
-    return fx, cx, fy, cy
+    return [fx, cx, fy, cy]
 
 
 def _distortion(message: Any) -> tuple[str, tuple[float, ...]]:
@@ -100,7 +103,7 @@ def _distortion(message: Any) -> tuple[str, tuple[float, ...]]:
 
 def _cropped(camera: CameraParameters, roi: Any) -> CameraParameters:
     x, y, width, height = int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height)
-    if width == height == 0:  # the ROS way to say: the whole image
+    if width == height == 0:  # in ROS: the whole image
         return camera
     if not (0 < width <= camera.width - x and 0 < height <= camera.height - y):
         raise MessageError(
@@ -121,9 +124,9 @@ def _binned(camera: CameraParameters, binning_x: int, binning_y: int) -> CameraP
 
 
 def info_message(factory: MessageFactory, camera: CameraParameters, stamp_ns: int) -> Any:
-    """A ``sensor_msgs/CameraInfo`` of a monocular camera: R is the identity, P holds K.
+    """Make the ``sensor_msgs/CameraInfo`` of a monocular camera: R is the identity, P holds K.
 
-    No distortion is said the way rectified ROS cameras say it: 'plumb_bob' with five zeros.
+    An undistorted camera is 'plumb_bob' with five zeros, as rectified ROS cameras publish it.
     """
     is_distorted = camera.distortion_model != 'none'
     k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1], dtype=np.float64)

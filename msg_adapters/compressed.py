@@ -1,6 +1,6 @@
-"""``sensor_msgs/CompressedImage`` as image_transport's plugins write it: JPEG and PNG, and PNG depth.
+"""Reads and makes ``sensor_msgs/CompressedImage`` as image_transport's plugins do: JPEG and PNG, and PNG depth.
 
-The format field says ``rgb8; jpeg compressed bgr8``, ``16UC1; png compressed``, ``32FC1; compressedDepth png``
+The format field is ``rgb8; jpeg compressed bgr8``, ``16UC1; png compressed``, ``32FC1; compressedDepth png``
 or just ``jpeg``. The compressedDepth data start with 12 bytes: an int32 and the floats A and B. Stored
 counts are millimetres for 16UC1; for 32FC1 they are inverse depth, ``count = A / metres + B``, 0 = no reading.
 """
@@ -26,22 +26,23 @@ _LARGEST_COUNT = 65535
 
 
 def decode_color(message: Any) -> Rgb:
-    """[H, W, 3] RGB of a JPEG or PNG.
+    """Decode a JPEG or PNG to [H, W, 3] RGB.
 
     Raises:
         MessageError: the message holds depth, another codec, or damaged data.
     """
     if 'compressedDepth' in message.format:
         raise MessageError(f"colour image has format '{message.format}', which is depth; check the topics' remapping")
-    return cv2.cvtColor(_decoded(bytes(message.data), cv2.IMREAD_COLOR, message.format), cv2.COLOR_BGR2RGB)
+    bgr = _decoded(bytes(message.data), cv2.IMREAD_COLOR, message.format)
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def decode_depth(message: Any, metres_per_count: float) -> Depth:
-    """[H, W] metres of a PNG, 0 = no reading.
+    """Decode a PNG to [H, W] metres, 0 = no reading.
 
     Args:
         message: the image.
-        metres_per_count: the step of 16UC1 and mono16.
+        metres_per_count: length of one count of 16UC1 and mono16.
 
     Raises:
         MessageError: the message holds colour, another codec, or damaged data.
@@ -89,7 +90,7 @@ def _decoded(data: bytes, flags: int, image_format: str) -> NDArray[Any]:
 
 
 def _is_complete(data: bytes) -> bool:
-    """Whether an end marker follows the pixels; OpenCV before 4.12 fills what is missing with grey."""
+    """Returns True if an end marker follows the pixels; OpenCV before 4.12 fills missing pixels with grey."""
     end, start = (b'\xff\xd9', b'\xff\xda') if data.startswith(_JPEG) else (b'IEND', b'IDAT')
     return data.rfind(end) > data.find(start) > 0 and data.rfind(end) > data.rfind(start)
 
@@ -102,7 +103,7 @@ def compressed_color_message(
     format: Literal['jpeg', 'png'] = 'jpeg',
     jpeg_quality: int = 95,
 ) -> Any:
-    """A ``sensor_msgs/CompressedImage`` of [H, W, 3] uint8 RGB, as image_transport's compressed plugin writes it.
+    """Make a ``sensor_msgs/CompressedImage`` of [H, W, 3] uint8 RGB, as image_transport's compressed plugin does.
 
     Raises:
         MessageError: the image has another shape or type, or the format is neither jpeg nor png.
@@ -121,10 +122,10 @@ def compressed_depth_message(
     frame_id: str,
     encoding: DepthEncoding = '16UC1',
 ) -> Any:
-    """A ``sensor_msgs/CompressedImage`` of [H, W] metres, as image_transport's compressedDepth plugin writes it.
+    """Make a ``sensor_msgs/CompressedImage`` of [H, W] metres, as image_transport's compressedDepth plugin does.
 
-    16UC1 rounds to whole millimetres (beyond 65.535 m: no reading). 32FC1 stores inverse depth, finest at
-    the nearest reading ``z0``: the rounding error at depth ``z`` is at most ``z**2 / (131070 z0)``.
+    16UC1 rounds to whole millimetres (beyond 65.535 m: no reading). 32FC1 stores inverse depth: with the nearest
+    reading at ``z0``, the rounding error at depth ``z`` is at most ``z**2 / (131070 z0)``.
 
     Raises:
         MessageError: the image has another shape or type, or the encoding is neither of the two.
@@ -142,7 +143,7 @@ def compressed_depth_message(
 
 
 def _inverse_counts(depth_m: Depth) -> tuple[float, NDArray[np.uint16]]:
-    """A and [H, W] counts with ``metres = A / count``; the nearest reading gets the largest count."""
+    """Returns A and [H, W] counts with ``metres = A / count``; the nearest reading has the largest count."""
     is_reading = depth_m > 0
     if not is_reading.any():
         return 0.0, np.zeros(depth_m.shape, np.uint16)

@@ -1,4 +1,4 @@
-"""The encodings of ``sensor_msgs/Image`` that are understood, and the pixels of such a message."""
+"""The supported encodings of ``sensor_msgs/Image``, and the conversion of its bytes to pixels."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from msg_adapters.errors import MessageError
 Rgb = NDArray[np.uint8]
 Depth = NDArray[np.float32]
 DepthEncoding = Literal['16UC1', '32FC1']
-"""The encodings of depth that are written."""
+"""The encodings in which depth images are made."""
 
 MILLIMETRES_PER_METRE = np.float32(1000)
 MILLIMETRE = 0.001
@@ -24,13 +24,13 @@ MILLIMETRE = 0.001
 
 @dataclass(frozen=True, slots=True)
 class Encoding:
-    """How a pixel is stored, and what it is turned into.
+    """How pixels are stored and converted.
 
     Attributes:
         dtype: type of one channel, without byte order.
-        channels: channels of a pixel.
-        convert: native [H, W] or [H, W, channels] pixels to RGB or metres; its result is a new array.
-        width_multiple: widths must be a multiple of this (pixels that share their colour).
+        channels: channels per pixel.
+        convert: converts [H, W] or [H, W, channels] pixels in native byte order to RGB or metres, as a new array.
+        width_multiple: widths must be a multiple of this, because neighbouring pixels share their colour.
     """
 
     dtype: str
@@ -40,13 +40,13 @@ class Encoding:
 
 
 def metres_from_counts(metres_per_count: float, counts: NDArray[np.uint16]) -> Depth:
-    """[H, W] metres of whole steps of some length; 0 stays 0, no reading."""
+    """Convert [H, W] counts of some length to metres; 0 stays 0, no reading."""
     return counts.astype(np.float32) / np.float32(1 / metres_per_count)  # 1000 and 5000 are exact, 0.001 is not
 
 
 def clean_metres(depth_m: NDArray[np.floating[Any]]) -> Depth:
-    """A copy with 0 wherever there is no reading: NaN, inf, negative."""
-    with np.errstate(over='ignore'):  # beyond float32 is inf, and no reading either
+    """Returns a copy in which NaN, inf and negative values are 0, no reading."""
+    with np.errstate(over='ignore'):  # values beyond float32 become inf, so no reading
         depth_m = depth_m.astype(np.float32, copy=False)
     clean = np.zeros(depth_m.shape, np.float32)
     np.copyto(clean, depth_m, where=(depth_m > 0) & (depth_m < np.inf))
@@ -54,7 +54,7 @@ def clean_metres(depth_m: NDArray[np.floating[Any]]) -> Depth:
 
 
 def _converted(code: int, image: Rgb) -> Rgb:
-    return cv2.cvtColor(image, code)
+    return np.asarray(cv2.cvtColor(image, code), np.uint8)
 
 
 def _color(channels: int, code: int, width_multiple: int = 1) -> Encoding:
@@ -67,7 +67,7 @@ COLOR: Mapping[str, Encoding] = {
     'rgba8': _color(4, cv2.COLOR_RGBA2RGB),
     'bgra8': _color(4, cv2.COLOR_BGRA2RGB),
     'mono8': _color(1, cv2.COLOR_GRAY2RGB),
-    # ROS names the first pixels of the first two rows, OpenCV's old names those of the second row and column.
+    # ROS names a Bayer pattern by its first pixels, OpenCV's old names by those from the second row and column on.
     'bayer_rggb8': _color(1, cv2.COLOR_BayerBG2RGB),
     'bayer_bggr8': _color(1, cv2.COLOR_BayerRG2RGB),
     'bayer_gbrg8': _color(1, cv2.COLOR_BayerGR2RGB),
@@ -80,7 +80,7 @@ COLOR: Mapping[str, Encoding] = {
 
 
 def depth_encodings(metres_per_count: float) -> Mapping[str, Encoding]:
-    """Those of depth; 16 bits are counts of some length, floats are metres."""
+    """Returns the encodings of depth images: 16-bit counts of some length, and floats in metres."""
     counts = Encoding('u2', 1, partial(metres_from_counts, metres_per_count))
     return {'16UC1': counts, 'mono16': counts, '32FC1': Encoding('f4', 1, clean_metres)}
 
@@ -90,11 +90,11 @@ def decode(message: Any, encodings: Mapping[str, Encoding], what: str) -> NDArra
 
     Args:
         message: the image.
-        encodings: what is understood.
-        what: 'colour' or 'depth', for the error.
+        encodings: the supported ones.
+        what: 'colour' or 'depth', for the error message.
 
     Raises:
-        MessageError: the encoding is none of them, or size, step and data do not agree.
+        MessageError: the encoding is not supported, or size, step and data do not agree.
     """
     encoding = encodings.get(message.encoding)
     if encoding is None:
@@ -105,7 +105,7 @@ def decode(message: Any, encodings: Mapping[str, Encoding], what: str) -> NDArra
 
 
 def _pixels(message: Any, encoding: Encoding) -> NDArray[Any]:
-    """[H, W] or [H, W, channels] in native byte order, without the padding at the end of rows."""
+    """Returns [H, W] or [H, W, channels] pixels in native byte order, without the padding at the end of rows."""
     dtype = np.dtype(encoding.dtype).newbyteorder('>' if message.is_bigendian else '<')
     height, width, step = int(message.height), int(message.width), int(message.step)
     row_bytes = width * encoding.channels * dtype.itemsize
@@ -124,9 +124,9 @@ def _check_layout(message: Any, encoding: Encoding, row_bytes: int, num_bytes: i
     if width % encoding.width_multiple:
         raise MessageError(f'{name}: the width must be a multiple of {encoding.width_multiple} in this encoding')
     if step < row_bytes:
-        raise MessageError(f'{name}: step is {step} bytes, but a row has {row_bytes}; the driver fills step wrongly')
+        raise MessageError(f'{name}: step is {step} bytes, but a row has {row_bytes}; the driver sets a wrong step')
     if num_bytes != height * step:
         raise MessageError(
             f'{name}: data has {num_bytes} bytes, but {height} rows of {step} are {height * step}; '
-            'the image is truncated or the driver describes it wrongly'
+            'the image is truncated, or the driver sets a wrong size or step'
         )

@@ -1,7 +1,7 @@
-"""Time that jumps back: a bag that loops, a simulation that restarts.
+"""Handles backward jumps of time: a bag that loops, a simulation that restarts.
 
-Streams do not jump together: the last depth images of a loop arrive among the first colour images of
-the next. So each message is put into an epoch, and only messages of the same epoch are comparable.
+Streams do not jump at the same moment: the last depth images of a loop arrive among the first colour images of
+the next. So each message is assigned to an epoch, and only messages of the same epoch are compared.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ class _Epoch:
 
 
 class EpochClock:
-    """Tells the epoch of each message by its stream and stamp.
+    """Assigns each message to an epoch by its stream and stamp.
 
     The last two epochs stay open, and a message belongs to the one whose newest messages are nearer to it. So
-    stragglers of a loop find their partners, and a single wrong stamp does not part the streams for good.
+    late messages of a loop find their partners, and a single wrong stamp does not separate the streams for good.
     """
 
     def __init__(self, jump_ns: int) -> None:
@@ -33,7 +33,7 @@ class EpochClock:
         self._open = [_Epoch(0)]
 
     def epoch_of(self, stream: str, stamp_ns: int) -> int:
-        """The epoch of the next message of a stream; a new one if the stream jumped back by more than ``jump_ns``."""
+        """Returns the epoch of the next message of a stream: a new one if the stream jumped back by more than ``jump_ns``."""
         epoch = min(reversed(self._open), key=lambda candidate: candidate.distance(stamp_ns))
         if epoch.is_jump(stream, stamp_ns, self._jump_ns):
             epoch = _Epoch(self._open[-1].number + 1)
@@ -42,5 +42,5 @@ class EpochClock:
         return epoch.number
 
     def close_before(self, number: int) -> None:
-        """Take no more messages into the epochs before this one."""
+        """Assign no more messages to the epochs before this one."""
         self._open = [epoch for epoch in self._open if epoch.number >= number]

@@ -1,5 +1,5 @@
-"""The error of a message that cannot be understood or made."""
+"""The error of this package."""
 
 
 class MessageError(ValueError):
-    """A message, or what should become one, that cannot be used: what, the value, what is allowed."""
+    """A message that cannot be used, or a value that cannot be put into one; says what, the value, and what is allowed."""

@@ -1,7 +1,7 @@
-"""Images to and from ``sensor_msgs/Image`` and ``sensor_msgs/CompressedImage``.
+"""Converts images to and from ``sensor_msgs/Image`` and ``sensor_msgs/CompressedImage``.
 
-Colour is [H, W, 3] uint8 RGB, depth [H, W] float32 metres with 0 = no reading; NaN, inf and negative depths
-never come out of here.
+Colour is [H, W, 3] uint8 RGB, depth [H, W] float32 metres with 0 = no reading. Decoded depth has no NaN, inf or
+negative values.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ __all__ = [
 
 
 def decode_color(message: Any) -> Rgb:
-    """[H, W, 3] uint8 RGB, contiguous, of an Image or CompressedImage; a copy, not a view of the message.
+    """Decode an Image or CompressedImage to [H, W, 3] uint8 RGB; a contiguous copy, not a view of the message.
 
     Raises:
-        MessageError: the encoding or format is not a supported colour one, or the data do not fit it.
+        MessageError: the encoding or format is no supported colour one, or the data do not fit it.
     """
     if _is_raw(message):
         return encodings.decode(message, encodings.COLOR, 'colour')
@@ -41,14 +41,14 @@ def decode_color(message: Any) -> Rgb:
 
 
 def decode_depth(message: Any, metres_per_count: float = MILLIMETRE) -> Depth:
-    """[H, W] float32 metres, 0 = no reading, of an Image or CompressedImage; a copy, not a view of the message.
+    """Decode an Image or CompressedImage to [H, W] float32 metres, 0 = no reading; a copy, not a view of the message.
 
     Args:
         message: the image.
-        metres_per_count: the step of 16UC1 and mono16; millimetres by REP 118. 32FC1 is metres in any case.
+        metres_per_count: length of one count of 16UC1 and mono16; a millimetre by REP 118. 32FC1 is always in metres.
 
     Raises:
-        MessageError: the encoding or format is not a supported depth one, or the data do not fit it.
+        MessageError: the encoding or format is no supported depth one, or the data do not fit it.
     """
     if _is_raw(message):
         return encodings.decode(message, encodings.depth_encodings(metres_per_count), 'depth')
@@ -56,12 +56,12 @@ def decode_depth(message: Any, metres_per_count: float = MILLIMETRE) -> Depth:
 
 
 def _is_raw(message: Any) -> bool:
-    """Image and CompressedImage have no common class between rclpy and rosbags, but only one has an encoding."""
+    """Returns True for an Image. rclpy and rosbags have different classes, but only Image has an encoding."""
     return hasattr(message, 'encoding')
 
 
 def color_message(factory: MessageFactory, rgb: Rgb, stamp_ns: int, frame_id: str) -> Any:
-    """An rgb8 ``sensor_msgs/Image`` of [H, W, 3] uint8.
+    """Make an rgb8 ``sensor_msgs/Image`` of [H, W, 3] uint8.
 
     Raises:
         MessageError: the image has another shape or type.
@@ -70,7 +70,7 @@ def color_message(factory: MessageFactory, rgb: Rgb, stamp_ns: int, frame_id: st
 
 
 def mono_message(factory: MessageFactory, image: NDArray[np.uint8], stamp_ns: int, frame_id: str) -> Any:
-    """A mono8 ``sensor_msgs/Image`` of [H, W] uint8.
+    """Make a mono8 ``sensor_msgs/Image`` of [H, W] uint8.
 
     Raises:
         MessageError: the image has another shape or type.
@@ -85,7 +85,7 @@ def depth_message(
     frame_id: str,
     encoding: DepthEncoding = '32FC1',
 ) -> Any:
-    """A depth ``sensor_msgs/Image`` of [H, W] metres, 0 = no reading.
+    """Make a depth ``sensor_msgs/Image`` of [H, W] metres, 0 = no reading.
 
     32FC1 keeps every value; 16UC1 rounds to whole millimetres (beyond 65.535 m: no reading).
 
@@ -101,7 +101,7 @@ def depth_message(
 
 
 def _image(factory: MessageFactory, pixels: NDArray[Any], encoding: str, stamp_ns: int, frame_id: str) -> Any:
-    """An unpadded little-endian image of contiguous or other [H, W, ...] pixels."""
+    """Make an unpadded little-endian image of [H, W, ...] pixels, contiguous or not."""
     little_endian = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder('<'))
     height, width = pixels.shape[:2]
     return factory.make(

@@ -1,7 +1,7 @@
-"""Which waiting colour and depth message belong together: a pure function of the two queues.
+"""Decides which waiting colour and depth messages belong together: a pure function of the two queues.
 
-The answer depends on the stamps alone, not on the order of arrival, as long as each stream's own stamps
-increase: where a message still to come could change it, it is 'not yet'.
+The result depends only on the stamps, not on the order of arrival, as long as the stamps of each stream
+increase. If a later message could change the result, there is no result yet.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 
 class Key(NamedTuple):
-    """When a message was taken: nanoseconds within an epoch. Epochs follow one another."""
+    """The time of a message: nanoseconds within an epoch. Later epochs have larger numbers."""
 
     epoch: int
     stamp_ns: int
@@ -26,17 +26,17 @@ class _Verdict(Enum):
 
 
 def first_pair(color: Sequence[Key], depth: Sequence[Key], max_interval_ns: int, is_final: bool = False) -> tuple[Key, Key] | None:
-    """The earliest colour and depth that belong together, as far as can be known.
+    """Returns the earliest colour and depth message that belong together; None if none is certain yet.
 
     A pair is at most ``max_interval_ns`` apart, and neither a message between the two nor the next one of the
-    older stream fits better. An exact match is known at once; others wait for the messages that could
-    fit better, unless these are known not to come.
+    older stream fits better. An exact match is certain at once. Other pairs wait for the messages that could
+    fit better, unless ``is_final``.
 
     Args:
         color: keys of the waiting colour messages, increasing.
         depth: keys of the waiting depth messages, increasing.
         max_interval_ns: largest distance of partners; 0 pairs equal stamps only.
-        is_final: nothing more will come.
+        is_final: True if no more messages will come.
     """
     i = j = 0
     while i < len(color) and j < len(depth):
@@ -53,9 +53,9 @@ def first_pair(color: Sequence[Key], depth: Sequence[Key], max_interval_ns: int,
 
 
 def _judge(older: Sequence[Key], other: Sequence[Key], max_interval_ns: int, is_final: bool) -> _Verdict:
-    """Whether the first of both are a pair, or the older of them will have no partner.
+    """Decide whether the first messages of both streams are a pair, or the older of them will have no partner.
 
-    Each holds the next message of its stream and, if that is known, the one after it.
+    Each sequence holds the next message of its stream and, if it has arrived, the one after it.
     """
     gap = _distance(older[0], other[0])
     if gap > max_interval_ns:
@@ -67,9 +67,9 @@ def _judge(older: Sequence[Key], other: Sequence[Key], max_interval_ns: int, is_
     rival_gap = _distance(older[1], other[0])
     if rival_gap >= gap:
         return _Verdict.PAIR
-    # The rival fits better; but if it has a still better partner of its own, everybody gets one.
-    is_rival_content = len(other) > 1 and _distance(older[1], other[1]) < rival_gap
-    return _Verdict.PAIR if is_rival_content else _Verdict.SKIP
+    # The rival fits better. But if it has an even better partner, all of them are paired.
+    rival_fits_elsewhere = len(other) > 1 and _distance(older[1], other[1]) < rival_gap
+    return _Verdict.PAIR if rival_fits_elsewhere else _Verdict.SKIP
 
 
 def _distance(a: Key, b: Key) -> float:

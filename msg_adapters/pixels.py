@@ -1,4 +1,4 @@
-"""Checks and conversions of arrays on their way into image messages."""
+"""Checks and converts arrays that are put into image messages."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from msg_adapters.errors import MessageError
 
 
 def checked_rgb(image: NDArray[Any]) -> Rgb:
-    """The image, if it is [H, W, 3] uint8."""
+    """Returns the image if it is [H, W, 3] uint8, else raises ``MessageError``."""
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
         raise _wrong('colour image', image, '[H, W, 3] uint8')
     return image
 
 
 def checked_mono(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """The image, if it is [H, W] uint8."""
+    """Returns the image if it is [H, W] uint8, else raises ``MessageError``."""
     if image.ndim != 2 or image.dtype != np.uint8 or not image.size:
         raise _wrong('mono image', image, '[H, W] uint8')
     return image
 
 
 def checked_depth(image: NDArray[Any]) -> NDArray[np.floating[Any]]:
-    """The image, if it is [H, W] floating-point metres."""
+    """Returns the image if it is [H, W] of a floating-point type, else raises ``MessageError``."""
     if image.ndim != 2 or image.dtype.kind != 'f' or not image.size:
         raise _wrong('depth image', image, '[H, W] float32 metres')
     return image
 
 
 def millimetres(depth_m: Depth) -> NDArray[np.uint16]:
-    """[H, W] whole millimetres of clean metres; what 16 bits cannot hold becomes 0, no reading."""
+    """Round [H, W] clean metres to whole millimetres; values that do not fit 16 bits become 0, no reading."""
     depth_mm = np.rint(depth_m * MILLIMETRES_PER_METRE)
     return np.where(depth_mm < 2**16, depth_mm, 0).astype(np.uint16)
 

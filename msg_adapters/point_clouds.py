@@ -1,4 +1,4 @@
-"""Coloured points to and from ``sensor_msgs/PointCloud2``.
+"""Converts coloured points to and from ``sensor_msgs/PointCloud2``.
 
 The fields are ``x y z rgb``, all FLOAT32; rgb holds the bits 0x00RRGGBB, as RViz expects.
 More FLOAT32 fields may follow.
@@ -25,10 +25,10 @@ def cloud_message(
     factory: MessageFactory, points: NDArray[np.float32], rgb: NDArray[np.uint8], stamp_ns: int, frame_id: str,
     extra: Mapping[str, NDArray[np.float32]] | None = None,
 ) -> Any:  # fmt: skip
-    """An unorganised ``sensor_msgs/PointCloud2``.
+    """Make an unorganised ``sensor_msgs/PointCloud2``.
 
     Args:
-        factory: who makes the message.
+        factory: makes the message.
         points: [N, 3] float32 metres.
         rgb: [N, 3] uint8.
         stamp_ns: stamp of the header.
@@ -75,7 +75,7 @@ def _packed(points: NDArray[np.float32], rgb: NDArray[np.uint8], extra: Sequence
 
 
 def read_cloud(message: Any) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Points [N, 3] float32 and colours [N, 3] uint8 of a ``sensor_msgs/PointCloud2``, organised or not.
+    """Returns points [N, 3] float32 and colours [N, 3] uint8 of a ``sensor_msgs/PointCloud2``, organised or not.
 
     Raises:
         MessageError: a field is missing or has another type, or the data are truncated.
@@ -87,7 +87,7 @@ def read_cloud(message: Any) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     if row_step < row_bytes or data.size != height * row_step:
         raise MessageError(
             f'point cloud of {height} rows of {width} points, {dtype.itemsize} bytes each, has row_step {row_step} '
-            f'and {data.size} bytes; it is truncated or described wrongly'
+            f'and {data.size} bytes; it is truncated or states a wrong size'
         )
     rows = np.ascontiguousarray(data.reshape(height, row_step)[:, :row_bytes])
     records = rows.reshape(-1).view(dtype)
@@ -97,7 +97,7 @@ def read_cloud(message: Any) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
 
 
 def _point_type(message: Any) -> np.dtype[Any]:
-    """The structured type of a point; rgb as the integer whose bits it is."""
+    """Returns the structured dtype of a point, with rgb as an integer of the same bits."""
     fields = {field.name: field for field in message.fields}
     offsets = []
     for name in _FIELDS:

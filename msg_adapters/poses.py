@@ -1,4 +1,4 @@
-"""Poses as [4, 4] matrices, to and from geometry_msgs and nav_msgs. Quaternions here are x, y, z, w."""
+"""Converts poses, as [4, 4] matrices, to and from geometry_msgs and nav_msgs. Quaternions here are x, y, z, w."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Matrix = NDArray[np.float64]
 
 
 def pose_matrix(pose: Any) -> Matrix:
-    """[4, 4] of a ``geometry_msgs/Pose``; its quaternion may have any length but zero.
+    """Convert a ``geometry_msgs/Pose`` to [4, 4]; the quaternion is normalised.
 
     Raises:
         MessageError: a number is not finite, or the quaternion is zero.
@@ -25,7 +25,7 @@ def pose_matrix(pose: Any) -> Matrix:
 
 
 def transform_matrix(transform: Any) -> Matrix:
-    """[4, 4] of a ``geometry_msgs/Transform``; its quaternion may have any length but zero.
+    """Convert a ``geometry_msgs/Transform`` to [4, 4]; the quaternion is normalised.
 
     Raises:
         MessageError: a number is not finite, or the quaternion is zero.
@@ -48,12 +48,12 @@ def _matrix(what: str, p: Any, q: Any) -> Matrix:
 
 
 def pose_message(factory: MessageFactory, T: Matrix) -> Any:
-    """A ``geometry_msgs/Pose`` of a [4, 4] rigid motion; the quaternion has w >= 0."""
+    """Make a ``geometry_msgs/Pose`` of a [4, 4] rigid motion; the quaternion has w >= 0."""
     return factory.make('geometry_msgs/msg/Pose', position=_xyz(factory, 'Point', T[:3, 3]), orientation=_quaternion(factory, T))
 
 
 def pose_stamped(factory: MessageFactory, T: Matrix, stamp_ns: int, frame_id: str) -> Any:
-    """A ``geometry_msgs/PoseStamped`` of a [4, 4] pose in ``frame_id``."""
+    """Make a ``geometry_msgs/PoseStamped`` of a [4, 4] pose in ``frame_id``."""
     return factory.make(
         'geometry_msgs/msg/PoseStamped',
         header=stamps.header(factory, stamp_ns, frame_id),
@@ -65,17 +65,17 @@ def odometry(
     factory: MessageFactory, T: Matrix, stamp_ns: int, frame_id: str, child_frame_id: str, *,
     pose_covariance: Matrix, twist: NDArray[np.float64], twist_covariance: Matrix,
 ) -> Any:  # fmt: skip
-    """A ``nav_msgs/Odometry`` of the [4, 4] pose of ``child_frame_id`` in ``frame_id``.
+    """Make a ``nav_msgs/Odometry`` of the [4, 4] pose of ``child_frame_id`` in ``frame_id``.
 
     Args:
-        factory: who makes the message.
+        factory: makes the message.
         T: [4, 4] pose.
         stamp_ns: stamp of the header.
         frame_id: frame the pose is in.
         child_frame_id: frame the pose is of.
         pose_covariance: [6, 6] of x y z and the rotations about x y z, in the axes of ``frame_id``.
         twist: [6] linear and angular velocity, in the axes of ``child_frame_id``.
-        twist_covariance: [6, 6] of it.
+        twist_covariance: [6, 6] covariance of ``twist``.
     """
     linear, angular = (_xyz(factory, 'Vector3', vector) for vector in (twist[:3], twist[3:]))
     return factory.make(
@@ -95,12 +95,12 @@ def odometry(
 
 
 def path(factory: MessageFactory, poses: Sequence[Any], stamp_ns: int, frame_id: str) -> Any:
-    """A ``nav_msgs/Path`` of ``geometry_msgs/PoseStamped``, each with its own stamp."""
+    """Make a ``nav_msgs/Path`` of ``geometry_msgs/PoseStamped``, each with its own stamp."""
     return factory.make('nav_msgs/msg/Path', header=stamps.header(factory, stamp_ns, frame_id), poses=list(poses))
 
 
 def transform_stamped(factory: MessageFactory, T: Matrix, stamp_ns: int, frame_id: str, child_frame_id: str) -> Any:
-    """A ``geometry_msgs/TransformStamped``: the [4, 4] pose of ``child_frame_id`` in ``frame_id``."""
+    """Make a ``geometry_msgs/TransformStamped`` of the [4, 4] pose of ``child_frame_id`` in ``frame_id``."""
     transform = factory.make(
         'geometry_msgs/msg/Transform', translation=_xyz(factory, 'Vector3', T[:3, 3]), rotation=_quaternion(factory, T)
     )
@@ -116,15 +116,15 @@ def _xyz(factory: MessageFactory, name: str, vector: NDArray[np.float64]) -> Any
 
 
 def _quaternion(factory: MessageFactory, T: Matrix) -> Any:
-    x, y, z, w = quaternion_xyzw(T[:3, :3])
+    x, y, z, w = quaternion_xyzw(T[:3, :3]).tolist()
     return factory.make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w)
 
 
-def quaternion_xyzw(R: Matrix) -> tuple[float, float, float, float]:
-    """Unit quaternion with w >= 0 of a [3, 3] rotation.
+def quaternion_xyzw(R: Matrix) -> Matrix:
+    """Returns the unit quaternion [4] with w >= 0 of a [3, 3] rotation.
 
-    The eigenvector of Bar-Itzhack's symmetric matrix with the largest eigenvalue: as exact for half
-    turns as for none, and the closest rotation where R is a little off (Bar-Itzhack 2000, version 3).
+    It is the eigenvector of Bar-Itzhack's symmetric matrix with the largest eigenvalue (Bar-Itzhack 2000, version 3):
+    accurate for all angles, and the closest rotation if R is not exactly orthonormal.
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.asarray(R, dtype=np.float64)
     lower = np.array(
@@ -136,8 +136,7 @@ def quaternion_xyzw(R: Matrix) -> tuple[float, float, float, float]:
         ]
     )
     q = np.linalg.eigh(lower, UPLO='L')[1][:, -1]
-    x, y, z, w = (q if q[3] >= 0 else -q).tolist()
-    return x, y, z, w
+    return q if q[3] >= 0 else -q
 
 
 def _rotation(xyzw: Matrix) -> Matrix:

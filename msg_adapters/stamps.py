@@ -1,4 +1,4 @@
-"""ROS times as integer nanoseconds, and the headers that carry them."""
+"""Converts ROS times to integer nanoseconds and back, and makes headers."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ NANOSECONDS = 1_000_000_000
 
 
 def to_ns(stamp: Any) -> int:
-    """Nanoseconds of a ``builtin_interfaces/Time``."""
+    """Convert a ``builtin_interfaces/Time`` to nanoseconds."""
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
 def from_ns(stamp_ns: int) -> tuple[int, int]:
-    """``(sec, nanosec)`` of nanoseconds, with nanosec in [0, 1e9).
+    """Convert nanoseconds to ``(sec, nanosec)`` with nanosec in [0, 1e9).
 
     Raises:
-        MessageError: the seconds do not fit the 32 bits that ROS has for them.
+        MessageError: the seconds do not fit ROS's 32 bits.
     """
     sec, nanosec = divmod(int(stamp_ns), NANOSECONDS)
     if not -(2**31) <= sec < 2**31:
@@ -29,28 +29,28 @@ def from_ns(stamp_ns: int) -> tuple[int, int]:
 
 
 def message_stamp_ns(message: Any) -> int:
-    """Nanoseconds of a message's header stamp."""
+    """Returns the stamp of a message's header in nanoseconds."""
     return to_ns(message.header.stamp)
 
 
 def serialized_stamp_ns(data: bytes) -> int:
-    """Nanoseconds of the stamp that the CDR bytes of a message begin with, without decoding the rest.
+    """Returns the stamp at the beginning of a serialized message in nanoseconds, without decoding the rest.
 
     Args:
-        data: a serialized message whose first field is a ``std_msgs/Header`` or a ``builtin_interfaces/Time``.
+        data: CDR bytes of a message whose first field is a ``std_msgs/Header`` or a ``builtin_interfaces/Time``.
 
     Raises:
         MessageError: there are too few bytes.
     """
     if len(data) < 12:
         raise MessageError(f'has {len(data)} bytes, too few for a header')
-    byte_order = '<' if data[1] & 1 else '>'  # the second of four bytes that tell the encoding
+    byte_order = '<' if data[1] & 1 else '>'  # second of the four bytes of the CDR encapsulation
     seconds, nanoseconds = struct.unpack_from(f'{byte_order}iI', data, 4)
     return seconds * NANOSECONDS + nanoseconds
 
 
 def header(factory: MessageFactory, stamp_ns: int, frame_id: str) -> Any:
-    """A ``std_msgs/Header``."""
+    """Make a ``std_msgs/Header``."""
     sec, nanosec = from_ns(stamp_ns)
     stamp = factory.make('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
     return factory.make('std_msgs/msg/Header', stamp=stamp, frame_id=frame_id)

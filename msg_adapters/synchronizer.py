@@ -1,7 +1,7 @@
 """Pairs colour, depth and CameraInfo by stamp, for live topics and bags alike.
 
-Messages are opaque: this module needs no ROS and no thread, and never looks inside one. Whoever calls
-from several threads takes a lock around the calls.
+Messages are opaque objects: this module needs no ROS and no threads. Callers from several threads must hold a lock
+around the calls.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class RgbdSet:
     Attributes:
         stamp_ns: the colour's stamp; increases from set to set until ``resets`` changes.
         color, depth, info: the messages, as they were added.
-        resets: how often time had jumped back before this set.
+        resets: number of backward jumps of time before this set.
         gap_ns: depth's stamp minus colour's.
     """
 
@@ -38,16 +38,16 @@ class RgbdSet:
 
 @dataclass(frozen=True, slots=True)
 class SyncStatistics:
-    """Where the messages went since the start. Each is received, and then one of: in a set, dropped, waiting.
+    """Counts of messages since the start. Each received message is in a set, dropped or waiting.
 
     Attributes:
         received_color, received_depth, received_info: messages added.
-        sets: sets given out.
+        sets: sets returned.
         unpaired_color, unpaired_depth: dropped; no partner came in time, or the queue was full.
         duplicates: dropped; a message of the same stream and stamp was already waiting or paired.
         late: dropped; a newer set had already been formed.
         without_info: pairs dropped because no CameraInfo came.
-        resets: backward jumps of time that sets came after.
+        resets: backward jumps of time after which there was a set.
         waiting_color, waiting_depth: messages waiting for their partner.
         waiting_pairs: pairs waiting for the first CameraInfo.
         gap_ns: depth's stamp minus colour's in the newest pair; None before the first.
@@ -74,15 +74,15 @@ class SyncStatistics:
 class RgbdSynchronizer:
     """Pairs the messages of three streams; each call returns the sets it completed, in order of their stamps.
 
-    - Exact mode pairs equal stamps. Approximate mode pairs the nearest within ``max_interval_ns`` and gives
-      a pair out once no better partner can come, so an inexact pair waits for the next message.
-    - Sets come in the order of their stamps, each message in one set at most. A message that is
-      older than the last set is dropped; one that is late but not that late still finds its partner.
+    - Exact mode pairs equal stamps. Approximate mode pairs the nearest stamps within ``max_interval_ns``, and returns
+      a pair once no better partner can come; so an inexact pair waits for the next message.
+    - Sets are returned in the order of their stamps, and each message is in at most one set. A message older than the
+      last set is dropped; a message that is less late still finds its partner.
     - A stamp more than ``jump_ns`` before its stream's newest starts a new epoch (a bag loops). The old
-      one is forgotten when the new one has its first pair; until then its stragglers still pair.
-    - A pair gets the CameraInfo of its colour's stamp if that is there, else the newest received.
-      Pairs wait for the first one.
-    - No more than ``queue_size`` messages of a stream, pairs without info, and infos are kept; oldest go first.
+      epoch ends when the new one has its first pair; until then its late messages still pair.
+    - A pair gets the CameraInfo with the stamp of its colour image if that has arrived, else the newest one.
+      Pairs wait for the first CameraInfo.
+    - At most ``queue_size`` messages of each stream, pairs without info, and infos are kept; the oldest are dropped first.
     """
 
     def __init__(
@@ -97,8 +97,8 @@ class RgbdSynchronizer:
         Args:
             mode: 'exact' or 'approximate'.
             max_interval_ns: largest distance of partners in approximate mode.
-            queue_size: how many messages of a stream may wait.
-            jump_ns: a stream whose stamps fall back by more than this has started anew.
+            queue_size: number of messages of a stream that may wait.
+            jump_ns: a stream whose stamps jump back by more than this has restarted.
 
         Raises:
             ValueError: a value is out of its range.
@@ -122,20 +122,20 @@ class RgbdSynchronizer:
         self._gap_ns: int | None = None
 
     def add_color(self, stamp_ns: int, message: Any) -> list[RgbdSet]:
-        """Take a colour image; returns the sets it completes."""
+        """Add a colour image. Returns the sets that it completes."""
         return self._add(self._color, stamp_ns, message)
 
     def add_depth(self, stamp_ns: int, message: Any) -> list[RgbdSet]:
-        """Take a depth image; returns the sets it completes."""
+        """Add a depth image. Returns the sets that it completes."""
         return self._add(self._depth, stamp_ns, message)
 
     def add_info(self, stamp_ns: int, message: Any) -> list[RgbdSet]:
-        """Take a CameraInfo; returns the sets that waited for the first one."""
+        """Add a CameraInfo. Returns the sets that waited for the first one."""
         self._infos.add(stamp_ns, message)
         return self._release()
 
     def flush(self) -> list[RgbdSet]:
-        """At the end of a recording: the sets that can still be made; what remains is dropped and counted."""
+        """End the recording. Returns the sets that can still be made; the remaining messages are dropped and counted."""
         self._form_pairs(is_final=True)
         sets = self._release()
         self._color.drop_all()
@@ -146,9 +146,11 @@ class RgbdSynchronizer:
 
     @property
     def statistics(self) -> SyncStatistics:
-        """Where the messages went until now."""
+        """The counts until now."""
         color, depth = self._color, self._depth
-        has_both = color.newest_ns is not None and depth.newest_ns is not None
+        newest_gap_ns = None
+        if color.newest_ns is not None and depth.newest_ns is not None:
+            newest_gap_ns = depth.newest_ns - color.newest_ns
         return SyncStatistics(
             received_color=color.received,
             received_depth=depth.received,
@@ -164,7 +166,7 @@ class RgbdSynchronizer:
             waiting_depth=len(depth.keys),
             waiting_pairs=len(self._pairs),
             gap_ns=self._gap_ns,
-            newest_gap_ns=depth.newest_ns - color.newest_ns if has_both else None,
+            newest_gap_ns=newest_gap_ns,
         )
 
     def _add(self, stream: _Stream, stamp_ns: int, message: Any) -> list[RgbdSet]:
@@ -201,7 +203,7 @@ class RgbdSynchronizer:
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
-    """A set that has no info yet."""
+    """A set without CameraInfo."""
 
     stamp_ns: int
     color: Any
@@ -211,7 +213,7 @@ class _Pair:
 
 
 class _Stream:
-    """The waiting messages of one stream, sorted, and what became of the others."""
+    """The waiting messages of one stream, sorted, and counts of the others."""
 
     def __init__(self, name: str, queue_size: int) -> None:
         self.name = name
@@ -234,7 +236,7 @@ class _Stream:
             self._messages[key] = message
 
     def take(self, key: Key) -> Any:
-        """The message of a key; older ones can be in no set any more and are dropped."""
+        """Returns the message of a key; older messages cannot be in a set any more and are dropped."""
         self._last_taken = key
         self._drop(self.keys.index(key))
         del self.keys[0]
@@ -254,7 +256,7 @@ class _Stream:
 
 
 class _Infos:
-    """The CameraInfos received last."""
+    """The CameraInfos that were received last."""
 
     def __init__(self, queue_size: int) -> None:
         self.received = 0
@@ -273,7 +275,7 @@ class _Infos:
             self._by_stamp.popitem(last=False)
 
     def at(self, stamp_ns: int) -> Any:
-        """The info of this stamp if it is there, else the newest received."""
+        """Returns the info of this stamp if it has arrived, else the newest one."""
         if stamp_ns in self._by_stamp:
             return self._by_stamp[stamp_ns]
         return self._by_stamp[next(reversed(self._by_stamp))]

@@ -1,4 +1,4 @@
-"""What every reader offers, and what is common to all: windows of a recording, nominal stamps, depth counts."""
+"""The interface of all readers, and what they share: windows of a recording, nominal stamps, depth counts."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ SPLITS = ('train', 'test')
 
 
 class Sequence(Protocol):
-    """A recording: frames in increasing time, read when they are asked for.
+    """A recording: frames with increasing stamps, read when they are asked for.
 
     Attributes:
-        name: what to call it in reports.
+        name: name in reports.
         camera: the ideal camera of every frame.
-        depth_scale: stored depth counts per metre; None where depth is stored as metres.
+        depth_scale: stored depth counts per metre; None if depth is stored in metres.
     """
 
     name: str
@@ -35,6 +35,7 @@ class Sequence(Protocol):
 
     def __len__(self) -> int:
         """Number of frames."""
+        ...
 
     def __getitem__(self, index: int) -> RgbdFrame:
         """Read one frame.
@@ -44,14 +45,16 @@ class Sequence(Protocol):
             DatasetError: the frame cannot be read.
             FrameError: its images do not fit the camera.
         """
+        ...
 
     def ground_truth(self) -> Trajectory | None:
-        """The true poses with stamps of their own, camera to the truth's own world; None where unknown."""
+        """True poses with their own stamps, camera to the ground truth's own world frame; None if unknown."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
 class BagTopics:
-    """Topics of a bag chosen by hand; None leaves the choice to the reader."""
+    """Topics of a bag that the user chose; None leaves the choice to the reader."""
 
     rgb: str | None = None
     depth: str | None = None
@@ -65,12 +68,12 @@ class ReadOptions:
     Attributes:
         width: width of the frames in pixels; None keeps the recorded size.
         start: index of the first frame.
-        max_frames: how many frames at most; None reads to the end.
+        max_frames: largest number of frames; None reads to the end.
         topics: which topics of a bag to read.
-        stride: every how manieth frame is read, from the first on.
-        crop: pixels cut off each edge, after resizing.
-        split: which part of a dataset that comes in parts, ``train`` or ``test``; None reads ``train``.
-        skip_bad: leave out the frames that the dataset itself flags as bad.
+        stride: read every n-th frame, beginning with the first.
+        crop: number of pixels to cut off each edge, after resizing.
+        split: ``train`` or ``test`` part of a dataset that has such parts; None reads ``train``.
+        skip_bad: True to skip frames that the dataset marks as bad.
     """
 
     width: int | None = None
@@ -96,7 +99,7 @@ class ReadOptions:
 
     @property
     def last_asked(self) -> int | None:
-        """Index of the last frame that could be asked for; None = the recording's last."""
+        """Index of the last frame that can be read; None = the recording's last one."""
         return None if self.max_frames is None else self.start + (self.max_frames - 1) * self.stride
 
 
@@ -105,15 +108,15 @@ class Format:
     """One row of the table of readers.
 
     Attributes:
-        name: what ``--format`` calls it.
-        expects: what a source of this format holds, for the error about an unknown one.
-        recognises: whether a SOURCE looks like this format; looks at names only.
-        open: opens the whole recording; the window of ``ReadOptions`` is cut by the caller.
-        is_path: whether a source is a file or folder.
-        has_topics: whether topics can be chosen.
-        has_splits: whether it comes as ``train`` and ``test``.
-        flags_bad: whether it says which frames are bad.
-        is_last_resort: taken only where no other format fits.
+        name: value of ``--format``.
+        expects: what a source of this format holds, for the error message about an unknown source.
+        recognises: returns True if a SOURCE looks like this format; examines names only.
+        open: opens the whole recording; the caller cuts out the window of ``ReadOptions``.
+        is_path: True if a source is a file or folder.
+        has_topics: True if topics can be chosen.
+        has_splits: True if the dataset has ``train`` and ``test`` parts.
+        flags_bad: True if the dataset marks bad frames.
+        is_last_resort: True to use this format only if no other one fits.
     """
 
     name: str
@@ -128,22 +131,22 @@ class Format:
 
 
 class Window:
-    """Some frames of another sequence, their edges cut off. The truth stays whole.
+    """Some frames of another sequence, with their edges cut off. The ground truth stays whole.
 
     Attributes:
-        name, camera, depth_scale: as ``Sequence`` has them.
+        name, camera, depth_scale: see ``Sequence``.
     """
 
     def __init__(self, sequence: Sequence, indices: range, crop: int = 0) -> None:
         """Choose frames.
 
         Args:
-            sequence: where they are.
-            indices: which.
-            crop: pixels to cut off each edge.
+            sequence: the whole recording.
+            indices: of the frames in it.
+            crop: number of pixels to cut off each edge.
 
         Raises:
-            DatasetError: cropping leaves less than 16 pixels.
+            DatasetError: fewer than 16 pixels remain in a direction.
         """
         whole = sequence.camera
         width, height = whole.width - 2 * crop, whole.height - 2 * crop
@@ -171,12 +174,12 @@ class Window:
         return replace(frame, rgb=np.ascontiguousarray(rgb), depth_m=np.ascontiguousarray(depth_m), camera=self.camera)
 
     def ground_truth(self) -> Trajectory | None:
-        """The truth of the whole recording."""
+        """The ground truth of the whole recording."""
         return self._sequence.ground_truth()
 
 
 def frame_or_none(sequence: Sequence, index: int) -> RgbdFrame | None:
-    """A frame, or None where its images do not fit the camera: SLAM did not take it either."""
+    """Returns a frame, or None if its images do not fit the camera: SLAM skips such frames too."""
     try:
         return sequence[index]
     except FrameError:
@@ -184,10 +187,10 @@ def frame_or_none(sequence: Sequence, index: int) -> RgbdFrame | None:
 
 
 def cut(sequence: Sequence, options: ReadOptions) -> Sequence:
-    """The part of a sequence that the options ask for.
+    """Returns the part of a sequence that the options select.
 
     Raises:
-        DatasetError: it would be empty.
+        DatasetError: the part is empty.
     """
     length = len(sequence)
     if options.start >= length:
@@ -198,20 +201,20 @@ def cut(sequence: Sequence, options: ReadOptions) -> Sequence:
 
 
 def nominal_stamp_ns(frame: int, rate_hz: int = NOMINAL_RATE_HZ) -> int:
-    """Stamp of a frame whose recording has none: from 1 s on, at its nominal rate."""
+    """Returns the stamp of a frame of a recording without stamps: frame 0 is at 1 s, the others follow at a nominal rate."""
     return FIRST_STAMP_NS + frame * 1_000_000_000 // rate_hz
 
 
 def metres(counts: NDArray[np.uint16], depth_scale: float) -> NDArray[np.float32]:
-    """Depth counts as float32 metres; 0 stays 0."""
+    """Convert depth counts to float32 metres; 0 stays 0."""
     return counts.astype(np.float32) / np.float32(depth_scale)
 
 
 def check_increasing(stamps_ns: NDArray[np.int64], name: str) -> None:
-    """Make sure that frames come in increasing time.
+    """Check that stamps increase from frame to frame.
 
     Raises:
-        DatasetError: they do not; says where.
+        DatasetError: they do not.
     """
     falls = np.flatnonzero(np.diff(stamps_ns) <= 0)
     if len(falls):

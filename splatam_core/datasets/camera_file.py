@@ -1,7 +1,22 @@
-"""Read the ``camera.yaml`` beside a recording."""
+"""``camera.yaml``: states the camera of the recording in whose folder it lies, and overrides the dataset's own.
+
+::
+
+    width: 640                          # pixels
+    height: 480
+    fx: 525.0                           # pixels
+    fy: 525.0
+    cx: 319.5                           # pixels; a pixel's centre is its integer index
+    cy: 239.5
+    distortion_model: plumb_bob         # optional: rational_polynomial, equidistant or none (default)
+    distortion: [0.1, -0.2, 0, 0, 0]    # optional: coefficients in OpenCV's order
+    depth_scale: 1000                   # optional: stored depth counts per metre
+    pose_axes: opencv                   # optional, plain folders only: or opengl
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,18 +26,21 @@ import yaml
 from splatam_core.errors import CameraError, one_line
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 
+NAME = 'camera.yaml'
+REQUIRED = frozenset({'width', 'height', 'fx', 'fy', 'cx', 'cy'})
+OPTIONAL = frozenset({'distortion_model', 'distortion', 'depth_scale', 'pose_axes'})
 POSE_AXES = ('opencv', 'opengl')
 
 
 @dataclass(frozen=True, slots=True)
 class CameraFile:
-    """What a ``camera.yaml`` beside a recording states.
+    """What a ``camera.yaml`` states.
 
     Attributes:
         calibration: the camera.
-        depth_scale: stored depth counts per metre; None where the file does not say.
+        depth_scale: stored depth counts per metre; None if the file does not say.
         pose_axes: axes of the camera in pose files: ``opencv`` (x right, y down, z forward) or ``opengl``
-            (x right, y up, z backward); None where the file does not say.
+            (x right, y up, z backward); None if the file does not say.
     """
 
     calibration: CameraCalibration
@@ -30,11 +48,57 @@ class CameraFile:
     pose_axes: str | None = None
 
 
-def read_camera_file(path: Path) -> CameraFile:
-    """Read ``width height fx fy cx cy distortion_model distortion depth_scale pose_axes`` from a YAML file.
+@dataclass(frozen=True, slots=True)
+class DatasetCamera:
+    """The camera of a dataset, whoever states it.
+
+    Attributes:
+        calibration: the camera.
+        depth_scale: stored depth counts per metre.
+    """
+
+    calibration: CameraCalibration
+    depth_scale: float
+
+
+def camera_of(folder: Path, otherwise: Callable[[], CameraCalibration], depth_scale: float) -> DatasetCamera:
+    """Returns the camera that a folder's ``camera.yaml`` states, else the dataset's own.
+
+    Args:
+        folder: may hold a ``camera.yaml``.
+        otherwise: returns the dataset's own camera; called only without ``camera.yaml``.
+        depth_scale: counts per metre, unless the file says otherwise.
 
     Raises:
-        CameraError: the file is no such mapping, or a key is missing, unknown or not a number.
+        CameraError: the file exists and cannot be used.
+        DatasetError: the dataset's own camera cannot be read.
+    """
+    stated = find_camera_file(folder)
+    if stated is None:
+        return DatasetCamera(otherwise(), depth_scale)
+    return DatasetCamera(stated.calibration, stated.depth_scale or depth_scale)
+
+
+def find_camera_file(folder: Path, *, may_state_axes: bool = False) -> CameraFile | None:
+    """Returns what a folder's ``camera.yaml`` states, or None without such a file.
+
+    Raises:
+        CameraError: the file exists and cannot be used.
+    """
+    path = folder / NAME
+    if not path.exists():
+        return None
+    stated = read_camera_file(path)
+    if stated.pose_axes is not None and not may_state_axes:
+        raise CameraError(f'{path}: pose_axes is for plain folders (--format folder); the axes of this one are known')
+    return stated
+
+
+def read_camera_file(path: Path) -> CameraFile:
+    """Read a ``camera.yaml``.
+
+    Raises:
+        CameraError: the file holds no such mapping, or a key is missing, unknown or not a number.
     """
     try:
         values = yaml.safe_load(path.read_text())
@@ -42,22 +106,20 @@ def read_camera_file(path: Path) -> CameraFile:
         raise CameraError(f'{path}: cannot be read: {one_line(error)}') from None
     if not isinstance(values, dict):
         raise CameraError(f'{path}: expected a mapping with width, height, fx, fy, cx, cy')
-    required = {'width', 'height', 'fx', 'fy', 'cx', 'cy'}
-    optional = {'distortion_model', 'distortion', 'depth_scale', 'pose_axes'}
-    if missing := required - values.keys():
+    if missing := REQUIRED - values.keys():
         raise CameraError(f'{path}: missing {", ".join(sorted(missing))}')
-    if unknown := values.keys() - required - optional:
+    if unknown := values.keys() - REQUIRED - OPTIONAL:
         raise CameraError(f'{path}: unknown {", ".join(sorted(map(str, unknown)))}')
     try:
-        return _camera_file(values)
-    except (TypeError, ValueError) as error:
-        raise CameraError(f'{path}: {error}') from None
-    except CameraError as error:
+        return _parse(values)
+    except (TypeError, ValueError, CameraError) as error:
         raise CameraError(f'{path}: {error}') from None
 
 
-def _camera_file(values: dict[str, Any]) -> CameraFile:
-    pinhole = PinholeCamera(int(values['width']), int(values['height']), *(float(values[key]) for key in ('fx', 'fy', 'cx', 'cy')))
+def _parse(values: dict[str, Any]) -> CameraFile:
+    width, height = int(values['width']), int(values['height'])
+    fx, fy, cx, cy = (float(values[key]) for key in ('fx', 'fy', 'cx', 'cy'))
+    pinhole = PinholeCamera(width, height, fx, fy, cx, cy)
     distortion = tuple(float(value) for value in values.get('distortion') or ())
     scale = values.get('depth_scale')
     if scale is not None and not float(scale) > 0:

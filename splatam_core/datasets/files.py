@@ -1,10 +1,10 @@
-"""The files datasets consist of: images, matrices, poses, numbered names. Every error names the file."""
+"""Reads the files that datasets consist of: images, matrices, poses, numbered names. Every error names the file."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,59 +13,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core.datasets.camera_file import CameraFile, read_camera_file
-from splatam_core.errors import CameraError, DatasetError
+from splatam_core.errors import DatasetError
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def camera_file(folder: Path, *, may_state_axes: bool = False) -> CameraFile | None:
-    """What a folder's ``camera.yaml`` states, or None where there is none.
-
-    Raises:
-        CameraError: the file is there and cannot be used.
-    """
-    path = folder / 'camera.yaml'
-    if not path.exists():
-        return None
-    stated = read_camera_file(path)
-    if stated.pose_axes is not None and not may_state_axes:
-        raise CameraError(f'{path}: pose_axes is for plain folders (--format folder); the axes of this one are known')
-    return stated
-
-
-def camera_of(folder: Path, otherwise: Callable[[], CameraCalibration], depth_scale: float) -> CameraFile:
-    """The camera that a folder's ``camera.yaml`` states, else the dataset's own.
-
-    Args:
-        folder: where the file may be.
-        otherwise: tells the camera where there is no such file.
-        depth_scale: counts per metre where the file does not say.
-
-    Raises:
-        CameraError: the file is there and cannot be used.
-        DatasetError: the dataset's own camera cannot be read.
-    """
-    stated = camera_file(folder)
-    if stated is None:
-        return CameraFile(otherwise(), depth_scale)
-    return CameraFile(stated.calibration, stated.depth_scale or depth_scale)
-
-
 def calibration_from_matrix(K: NDArray[np.float64], size: tuple[int, int]) -> CameraCalibration:
-    """An ideal camera from its intrinsic matrix, 3x3 or larger, and its images' width and height."""
-    return CameraCalibration(PinholeCamera(*size, *(float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))))
+    """Returns an ideal camera with an intrinsic matrix, 3x3 or larger, and the width and height of its images."""
+    fx, fy, cx, cy = (float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return CameraCalibration(PinholeCamera(*size, fx, fy, cx, cy))
 
 
 def numbered(folder: Path, pattern: str) -> dict[int, Path]:
-    """Files of a folder by the number in their names, in its order.
+    """Returns the files of a folder by the number in their names, in the order of the numbers.
 
     Args:
         folder: need not exist.
-        pattern: regular expression of the whole name; its group is the number. Of several files with
-            one number, the last by name counts (``.png`` before ``.jpg``).
+        pattern: regular expression of the whole name; its group is the number. If several files have the same
+            number, the last one by name counts (``.png`` before ``.jpg``).
     """
     paths = sorted(folder.iterdir()) if folder.is_dir() else []
     found = {int(match.group(1)): path for path in paths if (match := re.fullmatch(pattern, path.name))}
@@ -79,17 +46,17 @@ def read_color(path: Path) -> NDArray[np.uint8]:
     """Read a colour image file as RGB, [H, W, 3].
 
     Raises:
-        DatasetError: the file is missing or no image.
+        DatasetError: the file is missing or not an image.
     """
     image = _read_image(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def read_depth_counts(path: Path) -> NDArray[np.uint16]:
     """Read a 16-bit depth image file, [H, W] counts.
 
     Raises:
-        DatasetError: the file is missing, no image, or not one channel of 16 bits.
+        DatasetError: the file is missing, not an image, or not one channel of 16 bits.
     """
     counts = _read_image(path, cv2.IMREAD_UNCHANGED)
     if counts.dtype != np.uint16 or counts.ndim != 2:
@@ -104,7 +71,7 @@ def read_exr(path: Path) -> NDArray[np.float32]:
         DatasetError: the file cannot be read, has none of these channels, or OpenEXR is not installed.
     """
     try:
-        import OpenEXR  # a dependency of this format alone
+        import OpenEXR  # only this format needs it
     except ImportError:
         raise DatasetError(f"{path}: reading EXR needs OpenEXR: pip install 'splatam_ros[exr]'") from None
     try:
@@ -119,10 +86,10 @@ def read_exr(path: Path) -> NDArray[np.float32]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file.
+    """Returns the width and height of an image file.
 
     Raises:
-        DatasetError: the file is missing or no image.
+        DatasetError: the file is missing or not an image.
     """
     height, width = _read_image(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION).shape[:2]
     return width, height
@@ -146,7 +113,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object.
 
     Raises:
-        DatasetError: the file cannot be read, or is no object.
+        DatasetError: the file cannot be read, or holds no object.
     """
     try:
         values = json.loads(path.read_text())
@@ -159,7 +126,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def parsing(path: Path) -> Iterator[None]:
-    """What is taken out of a file inside this block is missing or of the wrong kind: one error that says so."""
+    """Turn errors about missing or unsuitable values, raised while a file's content is parsed, into ``DatasetError``."""
     try:
         yield
     except KeyError as error:
@@ -187,7 +154,7 @@ def _read_npy(path: Path) -> NDArray[np.float64]:
         return np.load(path, allow_pickle=False).astype(np.float64).reshape(-1)
     except OSError as error:
         raise DatasetError(f'{path}: cannot be read: {error}') from None
-    except (ValueError, TypeError, EOFError):  # numpy's own message advises to unpickle what may be anything
+    except (ValueError, TypeError, EOFError):  # numpy's own message advises unpickling, which is unsafe
         raise DatasetError(f'{path}: is no complete .npy file of numbers; is the copy complete?') from None
 
 
@@ -213,17 +180,17 @@ def read_matrix(path: Path, *sizes: int) -> NDArray[np.float64]:
 
 
 def pose(values: NDArray[np.float64], where: str) -> NDArray[np.float64] | None:
-    """A pose, its rotation made exact again where the file rounds it.
+    """Convert numbers to a pose whose rotation is orthonormal, even if the file rounds it.
 
     Args:
         values: 16 numbers of a 4x4 matrix, or the 12 of its upper rows.
-        where: what to call it in an error.
+        where: names the pose in an error message.
 
     Returns:
-        [4, 4]; None where a number is infinite or nan, the datasets' way to say that it is not known.
+        [4, 4]; None if a number is infinite or NaN, by which datasets mark unknown poses.
 
     Raises:
-        DatasetError: there are other than 12 or 16 numbers, or the upper left 3x3 is no rotation.
+        DatasetError: there are not 12 or 16 numbers, or the upper left 3x3 is no rotation.
     """
     values = np.asarray(values, np.float64).reshape(-1)
     if values.size not in (12, 16):
@@ -256,5 +223,5 @@ def read_pose_rows(path: Path) -> list[NDArray[np.float64] | None]:
 
 
 def from_opengl(T_world_cam: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-    """The same pose with the camera's axes x right, y down, z forward instead of x right, y up, z backward."""
+    """Convert a pose from OpenGL's camera axes (x right, y up, z backward) to OpenCV's (x right, y down, z forward)."""
     return None if T_world_cam is None else T_world_cam @ OPENCV_FROM_OPENGL

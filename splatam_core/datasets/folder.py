@@ -3,13 +3,13 @@
 ::
 
     my_recording/
-        rgb/  or  color/ or images/     # 000000.jpg or .png; of the numbers in a name, the last one counts
+        rgb/  or  color/ or images/     # 000000.jpg or .png; the last number in a name is the frame's
         depth/                          # 000000.png, 16 bit, same numbers and size; 0 and 65535 = no reading
-        camera.yaml                     # width height fx fy cx cy, and where needed: distortion_model distortion
-                                        #   depth_scale (else 1000, millimetres) pose_axes (else opencv);
+        camera.yaml                     # width height fx fy cx cy, and if needed: distortion_model distortion
+                                        #   depth_scale (default 1000, millimetres) pose_axes (default opencv);
                                         #   or one of the files below
         poses/  or  pose/               # one 4x4 camera to world for each frame, .txt or .npy; inf = not known
-                                        #   or one of the files below; may be missing
+                                        #   or one of the files below; optional
 
 Instead of ``camera.yaml``: Open3D's ``intrinsic.json`` or ``camera_intrinsic.json`` (open3d.org, "Reconstruction
 system": width, height, intrinsic_matrix in columns), or a 3x3 or 4x4 matrix in ``intrinsics.txt``, ``intrinsic.txt``
@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core.datasets import base, files
-from splatam_core.datasets.camera_file import CameraFile
+from splatam_core.datasets.camera_file import CameraFile, find_camera_file
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
 from splatam_core.errors import DatasetError
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
@@ -69,7 +69,7 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     )  # fmt: skip
     camera = _camera(folder, pairs[0].color)
 
-    def truth() -> Trajectory | None:
+    def ground_truth() -> Trajectory | None:
         poses = _poses(folder, numbers)
         if poses is not None and camera.pose_axes == 'opengl':
             poses = [files.from_opengl(pose) for pose in poses]
@@ -77,15 +77,15 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
 
     return ImagePairs(
         folder.resolve().name, pairs, camera.calibration,
-        DepthFormat(camera.depth_scale or DEPTH_SCALE, no_reading=NO_DEPTH), width=width, truth=truth,
+        DepthFormat(camera.depth_scale or DEPTH_SCALE, no_reading=NO_DEPTH), width=width, ground_truth=ground_truth,
     )  # fmt: skip
 
 
 def _present(folder: Path, names: Iterable[str]) -> str | None:
-    """The one of some files or folders that is there.
+    """Returns the name of the file or folder that exists; None if none does.
 
     Raises:
-        DatasetError: there are several.
+        DatasetError: several exist.
     """
     found = [name for name in names if (folder / name).exists()]
     if len(found) > 1:
@@ -94,7 +94,7 @@ def _present(folder: Path, names: Iterable[str]) -> str | None:
 
 
 def _by_number(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    """Files by the last number in their names, whose digits must tell them apart."""
+    """Returns files by the last number in their names, which must be unique."""
     paths = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in suffixes] if folder.is_dir() else []
     found: dict[int, Path] = {}
     for path in paths:
@@ -111,7 +111,7 @@ def _by_number(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
 
 
 def _camera(folder: Path, color: Path) -> CameraFile:
-    stated = files.camera_file(folder, may_state_axes=True)
+    stated = find_camera_file(folder, may_state_axes=True)
     if stated is not None:
         return stated
     name = _present(folder, JSON_FILES + MATRIX_FILES)
@@ -138,7 +138,7 @@ def _open3d_calibration(path: Path) -> CameraCalibration:
 
 
 def _poses(folder: Path, numbers: list[int]) -> Poses | None:
-    """The pose of each frame; None where there are none at all."""
+    """Returns the pose of each frame; None if the folder has no poses."""
     name = _present(folder, (*POSE_FOLDERS, *ROW_FILES, LOG_FILE))
     if name is None:
         return None
@@ -153,7 +153,7 @@ def _poses(folder: Path, numbers: list[int]) -> Poses | None:
 
 
 def _read_log(path: Path) -> Poses:
-    """Blocks of a line with three numbers of no use here, and four with the rows of a pose."""
+    """Read blocks of one line with three numbers, which are skipped, and four lines with the rows of a pose."""
     numbers = files.read_numbers(path)
     if numbers.size % 19:
         raise DatasetError(f'{path}: expected blocks of 3 + 16 numbers, got {numbers.size} numbers')

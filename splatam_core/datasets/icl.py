@@ -3,17 +3,17 @@
 ::
 
     living_room_traj2_frei_png/
-        associations.txt            # or:
-        livingRoom2.gt.freiburg     # frame tx ty tz qx qy qz qw, camera to world, y up; may be missing
+        associations.txt            # this or the next file
+        livingRoom2.gt.freiburg     # frame tx ty tz qx qy qz qw, camera to world, y up; optional
         rgb/0.png
         depth/0.png                 # 16 bit, 5000 counts per metre, along the axis; 0 = no reading
-        camera.yaml                 # may be missing: then 640x480, f 481.2 480, c 319.5 239.5
+        camera.yaml                 # optional: else 640x480, f 481.2 480, c 319.5 239.5
 
-Layout: doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html. The poses are of POV-Ray's left-handed world and camera, y up, while
-the rows of these images run down: they are mirrored here, T' = F T F with F = diag(1, -1, 1, 1), and fy is +480 (-480
-belongs to the POV-Ray files, which are not read; cuVSLAM's converter found the same, nvidia-isaac/cuVSLAM #135).
-Truth is read by the frame numbers it states: frame 0, and in the office 1, have none. ``.gt.sim`` states no numbers
-and is not read. The first frame is at 1 s, and the numbers in the names count at 30 Hz.
+Layout: doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html. The poses have POV-Ray's left-handed world and camera axes, y up, while
+image rows run downwards. The reader mirrors them, T' = F T F with F = diag(1, -1, 1, 1), and takes fy = +480 (-480
+belongs to the POV-Ray files, which are not read). cuVSLAM's converter does the same (nvidia-isaac/cuVSLAM #135).
+Ground truth is assigned by the frame numbers in its file: frame 0, and in the office scenes frame 1, have none.
+``.gt.sim`` has no frame numbers and is not read. The first frame is at 1 s, and the numbers in the names count at 30 Hz.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core.datasets import base, files
+from splatam_core.datasets.camera_file import camera_of
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
 from splatam_core.errors import DatasetError
 from splatam_core.geometry import se3
@@ -44,17 +45,19 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     """
     color = files.numbered(folder / 'rgb', r'(\d+)\.png')
     pairs = pair_up(color, files.numbered(folder / 'depth', r'(\d+)\.png'), folder, 'rgb/0.png with depth/0.png')
-    camera = files.camera_of(folder, lambda: CAMERA, DEPTH_SCALE)
+    camera = camera_of(folder, lambda: CAMERA, DEPTH_SCALE)
 
-    def truth() -> Trajectory | None:
+    def ground_truth() -> Trajectory | None:
         poses = _poses(folder)
         return trajectory(pairs, [poses.get(number) for number in color])
 
-    return ImagePairs(folder.resolve().name, pairs, camera.calibration, DepthFormat(camera.depth_scale), width=width, truth=truth)
+    return ImagePairs(
+        folder.resolve().name, pairs, camera.calibration, DepthFormat(camera.depth_scale), width=width, ground_truth=ground_truth
+    )
 
 
 def _poses(folder: Path) -> dict[int, NDArray[np.float64]]:
-    """Pose of each frame number that has one."""
+    """Returns the poses by frame number."""
     paths = sorted(folder.glob('*.gt.freiburg'))
     if len(paths) > 1:
         raise DatasetError(f'{folder}: holds {", ".join(path.name for path in paths)}; keep the one that belongs to it')

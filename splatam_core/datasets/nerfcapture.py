@@ -4,15 +4,15 @@
 
     my_capture/
         transforms.json         # fl_x fl_y cx cy w h integer_depth_scale, and frames: file_path depth_path
-                                #   transform_matrix, with fl_x ... of their own
+                                #   transform_matrix, each with its own fl_x ...
         rgb/0.png
         depth/0.png             # 16 bit, integer_depth_scale metres a count (10/65535), 0 = no reading
-        camera.yaml             # may be missing; wins over the cameras in transforms.json
+        camera.yaml             # optional; overrides the cameras in transforms.json
 
 Layout: ``scripts/nerfcapture2dataset.py`` (github.com/spla-tam/SplaTAM) and instant-ngp's ``nerfcapture2nerf.py``.
-Poses are ARKit's, with OpenGL's camera axes. Each frame has a camera of its own, for the lens focuses: frames are
-rectified to the first one's. Frames without depth are left out. There are no stamps: frames come at 30 Hz, the first
-at 1 s.
+Poses are ARKit's, with OpenGL's camera axes. The intrinsics differ between frames because the lens focuses; all frames
+are rectified to the first frame's camera. Frames without depth are skipped. There are no stamps: frames come at 30 Hz,
+the first at 1 s.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core.datasets import base, files, nerfstudio
+from splatam_core.datasets.camera_file import camera_of
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
 from splatam_core.errors import DatasetError
 from splatam_core.geometry.camera import CameraCalibration
@@ -37,7 +38,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class _Capture:
-    """What ``transforms.json`` says about the frames that have depth, by their position."""
+    """What ``transforms.json`` states about the frames that have depth, by their index."""
 
     calibration: CameraCalibration
     color: dict[int, Path]
@@ -60,10 +61,10 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
         capture.color, capture.depth, folder, 'rgb/0.png with depth/0.png in transforms.json',
         calibrations=None if has_file else capture.calibrations,
     )  # fmt: skip
-    camera = files.camera_of(folder, lambda: capture.calibration, capture.depth_scale)
+    camera = camera_of(folder, lambda: capture.calibration, capture.depth_scale)
     return ImagePairs(
         folder.resolve().name, pairs, camera.calibration, DepthFormat(camera.depth_scale),
-        width=width, truth=lambda: trajectory(pairs, capture.poses),
+        width=width, ground_truth=lambda: trajectory(pairs, capture.poses),
     )  # fmt: skip
 
 
@@ -78,17 +79,17 @@ def _read_transforms(folder: Path) -> _Capture:
             raise DatasetError(f'{path}: none of {len(values["frames"])} frames has a depth_path')
         cameras = [nerfstudio.calibration({**values, **frame}) for frame in frames]
         return _Capture(
-            cameras[0],
-            {index: _image(folder, frame['file_path']) for index, frame in enumerate(frames)},
-            {index: _image(folder, frame['depth_path']) for index, frame in enumerate(frames)},
-            dict(enumerate(cameras)),
-            [nerfstudio.pose(frame, f'{path}, frame {index}') for index, frame in enumerate(frames)],
-            1 / float(values.get('integer_depth_scale', METRES_PER_COUNT)),
+            calibration=cameras[0],
+            color={index: _image(folder, frame['file_path']) for index, frame in enumerate(frames)},
+            depth={index: _image(folder, frame['depth_path']) for index, frame in enumerate(frames)},
+            calibrations=dict(enumerate(cameras)),
+            poses=[nerfstudio.pose(frame, f'{path}, frame {index}') for index, frame in enumerate(frames)],
+            depth_scale=1 / float(values.get('integer_depth_scale', METRES_PER_COUNT)),
         )
 
 
 def _image(folder: Path, name: Any) -> Path:
-    """The file that a path in the list means; NeRFCapture's own lists leave the suffix out."""
+    """Returns the file that a path in the list refers to; NeRFCapture's own lists omit the suffix."""
     path = folder / str(name)
     return path if path.suffix else path.with_suffix('.png')
 

@@ -1,4 +1,4 @@
-"""Recordings that are pairs of image files, colour and depth: the form in which nearly every dataset comes."""
+"""Sequences of colour and depth image files, the form of nearly every dataset."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ImagePair:
         stamp_ns: time of the exposure.
         color: image file.
         depth: image file, registered to colour.
-        calibration: the frame's own camera; None where all frames have the same.
+        calibration: the frame's own camera; None if all frames have the same.
     """
 
     stamp_ns: int
@@ -41,9 +41,9 @@ class DepthFormat:
 
     Attributes:
         scale: counts per metre of 16-bit images; None for OpenEXR images in metres.
-        no_reading: counts that mean none, besides 0.
-        size: width and height of the depth images where they show colour's view in another size.
-        camera: their camera where it is another than colour's, from the same centre along the same axes.
+        no_reading: count that means 'no reading', besides 0.
+        size: width and height of the depth images if they show colour's view at another size.
+        camera: camera of the depth images if it is not colour's; it has the same centre and axes.
     """
 
     scale: float | None
@@ -55,7 +55,7 @@ class DepthFormat:
         """Read depth in metres, [H, W].
 
         Raises:
-            DatasetError: the file cannot be read as such.
+            DatasetError: the file cannot be read as depth.
         """
         if self.scale is None:
             return files.read_exr(path)
@@ -65,12 +65,12 @@ class DepthFormat:
         return base.metres(counts, self.scale)
 
     def camera_of(self, color: PinholeCamera) -> PinholeCamera | None:
-        """The camera of the depth images; None where it is colour's."""
+        """Returns the camera of the depth images; None if it is colour's."""
         return self.camera if self.size is None else color.resized(*self.size)
 
 
 class ImagePairs:
-    """A recording of image files."""
+    """A sequence of image files, read when a frame is asked for."""
 
     def __init__(
         self,
@@ -79,29 +79,29 @@ class ImagePairs:
         calibration: CameraCalibration,
         depth: DepthFormat,
         *,
-        truth: Callable[[], Trajectory | None],
+        ground_truth: Callable[[], Trajectory | None],
         width: int | None = None,
     ) -> None:
-        """Describe a recording; files are read when a frame is asked for.
+        """Check the order of stamps and the size of the first image.
 
         Args:
-            name: what to call it in reports.
+            name: name in reports.
             pairs: in the order of their stamps.
-            calibration: the camera; frames with one of their own are rectified to its pinhole.
+            calibration: the camera; frames with a camera of their own are rectified to its pinhole.
             depth: how depth is stored.
-            truth: reads the true poses, when they are asked for.
-            width: of the frames in pixels; None keeps the recorded size.
+            ground_truth: reads the true poses when they are asked for.
+            width: width of the frames in pixels; None keeps the recorded size.
 
         Raises:
-            DatasetError: stamps do not increase, or the first image that can be read is not of the camera's size.
+            DatasetError: stamps do not increase, or the first readable image does not have the camera's size.
         """
         base.check_increasing(np.array([pair.stamp_ns for pair in pairs], np.int64), name)
         _check_size(pairs, calibration)
         self.name = name
         self.depth_scale = depth.scale
         self._pairs, self._calibration, self._depth, self._width = pairs, calibration, depth, width
-        self._truth = truth
-        self._factory = lru_cache(maxsize=2)(self._make_factory)  # one for all frames, or another for each
+        self._ground_truth = ground_truth
+        self._factory = lru_cache(maxsize=2)(self._make_factory)  # one for all frames, or one per frame
         self.camera = self._factory(calibration).camera
 
     def __len__(self) -> int:
@@ -114,8 +114,8 @@ class ImagePairs:
         return factory.make(pair.stamp_ns, files.read_color(pair.color), self._depth.read(pair.depth))
 
     def ground_truth(self) -> Trajectory | None:
-        """The true poses that the dataset has."""
-        return self._truth()
+        """The true poses; None if the dataset has none."""
+        return self._ground_truth()
 
     def _make_factory(self, calibration: CameraCalibration) -> FrameFactory:
         rectified = self._calibration.pinhole
@@ -123,17 +123,17 @@ class ImagePairs:
 
 
 def _check_size(pairs: Sequence[ImagePair], calibration: CameraCalibration) -> None:
-    """Make sure that the camera is that of the images: otherwise every frame would be left out, one by one."""
+    """Check that the camera fits the images: if not, every single frame would be rejected later."""
     for pair in pairs:
         try:
             width, height = files.image_size(pair.color)
         except DatasetError:
-            continue  # its own frame says so
+            continue  # reading that frame reports it
         stated = (pair.calibration or calibration).pinhole
         if (width, height) != (stated.width, stated.height):
             raise DatasetError(
-                f'{pair.color}: is {width}x{height}, but the camera is that of {stated.width}x{stated.height} images; state the '
-                'camera of these in a camera.yaml in the folder'
+                f'{pair.color}: is {width}x{height}, but the camera is for {stated.width}x{stated.height} images; state the camera '
+                'of these images in a camera.yaml in the folder'
             )
         return
 
@@ -147,15 +147,15 @@ def pair_up(
     rate_hz: int = base.NOMINAL_RATE_HZ,
     calibrations: Mapping[int, CameraCalibration] | None = None,
 ) -> list[ImagePair]:
-    """Pair images by their numbers, which count time: the first is at 1 s.
+    """Pair images by their numbers, which count time from the first frame at 1 s.
 
     Args:
-        color: files by number, in its order.
-        depth: the same; may have more.
-        folder: what to call them in an error.
-        expected: names of a colour and a depth image, for the error.
-        rate_hz: how fast the numbers count.
-        calibrations: cameras of frames that have one of their own.
+        color: files by number, in the order of the numbers.
+        depth: likewise; may have more files.
+        folder: names the dataset in an error message.
+        expected: names of a colour and a depth image, for the error message.
+        rate_hz: the numbers count at this rate.
+        calibrations: cameras of frames that have their own.
 
     Raises:
         DatasetError: there is no colour image, or one has no depth.
@@ -176,7 +176,7 @@ def pair_up(
 
 
 def trajectory(pairs: Sequence[ImagePair], poses: Sequence[NDArray[np.float64] | None]) -> Trajectory | None:
-    """The poses that are known, at the stamps of their frames; None where none is."""
+    """Returns the known poses at the stamps of their frames; None if none is known."""
     known = [(pair.stamp_ns, T) for pair, T in zip(pairs, poses, strict=True) if T is not None]
     if not known:
         return None
@@ -185,12 +185,12 @@ def trajectory(pairs: Sequence[ImagePair], poses: Sequence[NDArray[np.float64] |
 
 
 def row_trajectory(path: Path, pairs: Sequence[ImagePair], rows: Sequence[int]) -> Trajectory | None:
-    """The poses of a file that has one in each line; None where there is no such file.
+    """Returns the poses of a file with one pose per line; None if there is no such file.
 
     Args:
         path: see ``files.read_pose_rows``.
         pairs: the frames.
-        rows: the line of each, from 0.
+        rows: line of each frame's pose, from 0.
 
     Raises:
         DatasetError: the file cannot be read or has too few lines.

@@ -4,14 +4,14 @@
 
     EXR_RGBD/
         metadata.json           # w h, K (3x3 in columns), fps, poses [qx qy qz qw tx ty tz];
-                                #   perFrameIntrinsicCoeffs [fx fy cx cy] may be missing
+                                #   perFrameIntrinsicCoeffs [fx fy cx cy] optional
         rgb/0.jpg               # or .png
         depth/0.exr             # metres, 0 = no reading; may be smaller than colour
-        camera.yaml             # may be missing; wins over the cameras in metadata.json
+        camera.yaml             # optional; overrides the cameras in metadata.json
 
 Layout: record3d.app, and nerfstudio's ``process_data/record3d_utils.py`` (github.com/nerfstudio-project/nerfstudio).
-Poses are ARKit's, with OpenGL's camera axes. Each frame may have a camera of its own: frames are rectified to the first
-one's. The first frame is at 1 s, and the numbers in the names count at ``fps``. Needs OpenEXR (``splatam_ros[exr]``).
+Poses are ARKit's, with OpenGL's camera axes. Intrinsics may differ between frames; all frames are rectified to the first
+frame's camera. The first frame is at 1 s, and the numbers in the names count at ``fps``. Needs OpenEXR (``splatam_ros[exr]``).
 ``.r3d`` files, whose depth is compressed with LZFSE, are not read: export them as EXR + RGB.
 """
 
@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core.datasets import base, files
+from splatam_core.datasets.camera_file import camera_of
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
 from splatam_core.errors import DatasetError
 from splatam_core.geometry import se3
@@ -47,11 +48,11 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
         poses = [_pose(metadata, number, path) for number in color]
     own = None if (folder / 'camera.yaml').exists() else cameras
     pairs = pair_up(color, depth, folder, 'rgb/0.jpg with depth/0.exr', rate_hz=rate_hz, calibrations=own)
-    camera = files.camera_of(folder, lambda: cameras[next(iter(color))], 1.0)
+    camera = camera_of(folder, lambda: cameras[next(iter(color))], 1.0)
     size = files.read_exr(pairs[0].depth).shape
     return ImagePairs(
         folder.resolve().name, pairs, camera.calibration, DepthFormat(None, size=(size[1], size[0])),
-        width=width, truth=lambda: trajectory(pairs, poses),
+        width=width, ground_truth=lambda: trajectory(pairs, poses),
     )  # fmt: skip
 
 
@@ -65,7 +66,7 @@ def _cameras(metadata: dict[str, Any], numbers: list[int]) -> dict[int, CameraCa
 
 
 def _pose(metadata: dict[str, Any], number: int, path: Path) -> NDArray[np.float64] | None:
-    """A frame's pose; None where the recording has none, as the selfie camera's."""
+    """Returns a frame's pose; None if the recording has none, as with the selfie camera."""
     poses = metadata.get('poses')
     if not poses:
         return None

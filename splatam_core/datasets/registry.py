@@ -1,4 +1,4 @@
-"""The table of readers, and opening a recording without being told its format."""
+"""The table of readers. Opens a recording and recognises its format."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ READERS = {
     'folder': 'splatam_core.datasets.folder',
     'rosbag': 'splatam_core.datasets.bag.sequence',
 }
-"""Format name to module. A module holds its row as ``FORMAT`` and is imported when it is looked at."""
+"""Maps the name of a format to the module that exports it as ``FORMAT``; modules are imported when needed."""
 
 
 def open_sequence(
@@ -44,21 +44,24 @@ def open_sequence(
     Args:
         source: a dataset folder, a bag (rosbag2 folder, ``.db3``, ``.mcap``; ROS 1 ``.bag``), or
             ``synthetic[:options]``.
-        format: one of ``READERS``; guessed from the source when None.
+        format: one of ``READERS``; None recognises it by the source.
         width: width of the frames in pixels; None keeps the recorded size.
         start: index of the first frame.
-        max_frames: how many frames at most.
-        topics: which topics of a bag to read; those left None are found by type.
-        stride: every how manieth frame is read; ``max_frames`` counts those.
-        crop: pixels cut off each edge of the frames, after resizing.
-        split: ``train`` or ``test``, of a dataset that comes so; None reads ``train``.
-        skip_bad: leave out the frames that the dataset itself flags as bad.
+        max_frames: largest number of frames; None reads to the end.
+        topics: which topics of a bag to read; those that are None are found by type.
+        stride: read every n-th frame; ``max_frames`` counts the frames that are read.
+        crop: number of pixels to cut off each edge, after resizing.
+        split: ``train`` or ``test`` part of a dataset that has such parts; None reads ``train``.
+        skip_bad: True to skip frames that the dataset marks as bad.
 
     Raises:
-        DatasetError: the source is of no known format, is broken, or has no such frames.
+        DatasetError: the source has no known format, is damaged, or has no such frames.
         CameraError: its camera cannot be used.
     """
-    options = ReadOptions(width, start, max_frames, topics or BagTopics(), stride, crop, split, skip_bad)
+    options = ReadOptions(
+        width=width, start=start, max_frames=max_frames, topics=topics or BagTopics(),
+        stride=stride, crop=crop, split=split, skip_bad=skip_bad,
+    )  # fmt: skip
     reader = _reader(format) if format is not None else _guess(source)
     if reader.is_path and not Path(source).exists():
         raise DatasetError(f'{source}: there is no such file or folder')
@@ -70,14 +73,14 @@ def open_sequence(
 
 
 def _check_options(source: str, reader: Format, options: ReadOptions) -> None:
-    """Make sure that nothing is asked for that the format cannot give."""
-    asked_in_vain = [
+    """Refuse options that the format does not have."""
+    unsuitable = [
         ('there are no topics to choose', options.topics != BagTopics() and not reader.has_topics),
         ('there is no train or test split', options.split is not None and not reader.has_splits),
         ('no frames are flagged as bad', options.skip_bad and not reader.flags_bad),
     ]
-    for reason, is_so in asked_in_vain:
-        if is_so:
+    for reason, is_given in unsuitable:
+        if is_given:
             raise DatasetError(f'{source}: is read as {reader.name}, where {reason}; leave that option out')
 
 
@@ -104,13 +107,13 @@ def _guess(source: str) -> Format:
 
 
 def _fitting(source: str, readers: list[Format]) -> list[Format]:
-    """The formats a source looks like; the last resort only where it looks like no other."""
+    """Returns the formats that a source looks like; the last resort only if it looks like no other."""
     fitting = [reader for reader in readers if reader.recognises(source)]
     return [reader for reader in fitting if not reader.is_last_resort] or fitting
 
 
 def _nearby(path: Path, readers: list[Format], at_most: int = 100) -> str:
-    """What was perhaps meant: something in it, or the folder it is in; nothing where neither is a recording."""
+    """Returns a hint at a recording in the folder or above it, for an error message; empty if there is none."""
     inside = sorted(path.iterdir()) if path.is_dir() else []
     inside = [entry for entry in inside if entry.is_dir() or entry.suffix in ('.bag', '.mcap')][:at_most]
     guesses = [

@@ -3,13 +3,13 @@
 ::
 
     Replica/
-        cam_params.json             # or in room0/; may be missing: then 1200x680, f 600, c 599.5 339.5, 6553.5
+        cam_params.json             # or in room0/; optional: else 1200x680, f 600, c 599.5 339.5, depth 6553.5
         room0/                      # SOURCE
-            traj.txt                # 4x4 camera to world in each line, one a frame; may be missing
+            traj.txt                # 4x4 camera to world in each line, one per frame; optional
             results/
                 frame000000.jpg
                 depth000000.png     # 16 bit, 6553.5 counts per metre, 0 = no reading
-            camera.yaml             # may be missing; wins
+            camera.yaml             # optional; overrides cam_params.json
 
 Layout: NICE-SLAM, ``scripts/download_replica.sh`` and ``configs/Replica`` (github.com/cvg/nice-slam). Camera axes are
 OpenCV's. There are no stamps: the first frame is at 1 s, and the numbers in the names count at 30 Hz.
@@ -20,11 +20,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatam_core.datasets import base, files
-from splatam_core.datasets.camera_file import CameraFile
+from splatam_core.datasets.camera_file import DatasetCamera, camera_of
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, row_trajectory
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 
-CAMERA = CameraFile(CameraCalibration(PinholeCamera(1200, 680, 600.0, 600.0, 599.5, 339.5)), 6553.5)
+CAMERA = DatasetCamera(CameraCalibration(PinholeCamera(1200, 680, 600.0, 600.0, 599.5, 339.5)), 6553.5)
 
 
 def read(folder: Path, *, width: int | None = None) -> ImagePairs:
@@ -38,21 +38,23 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     depth = files.numbered(folder / 'results', r'depth(\d+)\.png')
     pairs = pair_up(color, depth, folder, 'results/frame000000.jpg with results/depth000000.png')
     own = _camera(folder)
-    camera = files.camera_of(folder, lambda: own.calibration, own.depth_scale)
+    camera = camera_of(folder, lambda: own.calibration, own.depth_scale)
     return ImagePairs(
         folder.resolve().name, pairs, camera.calibration, DepthFormat(camera.depth_scale),
-        width=width, truth=lambda: row_trajectory(folder / 'traj.txt', pairs, list(color)),
+        width=width, ground_truth=lambda: row_trajectory(folder / 'traj.txt', pairs, list(color)),
     )  # fmt: skip
 
 
-def _camera(folder: Path) -> CameraFile:
+def _camera(folder: Path) -> DatasetCamera:
     for path in (folder / 'cam_params.json', folder.resolve().parent / 'cam_params.json'):
         if path.exists():
             values = files.read_json(path)
             with files.parsing(path):
                 c = values['camera']
-                pinhole = PinholeCamera(int(c['w']), int(c['h']), *(float(c[key]) for key in ('fx', 'fy', 'cx', 'cy')))
-                return CameraFile(CameraCalibration(pinhole), float(c['scale']))
+                width, height = int(c['w']), int(c['h'])
+                fx, fy, cx, cy = (float(c[key]) for key in ('fx', 'fy', 'cx', 'cy'))
+                pinhole = PinholeCamera(width, height, fx, fy, cx, cy)
+                return DatasetCamera(CameraCalibration(pinhole), float(c['scale']))
     return CAMERA
 
 

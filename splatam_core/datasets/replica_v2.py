@@ -1,16 +1,16 @@
-"""Replica-V2: Replica as vMAP rendered it, with a second camera path to test novel views on.
+"""Replica-V2: Replica as vMAP rendered it, with a second camera path for testing novel views.
 
 ::
 
     room_0/                         # SOURCE
         imap/
             00/                     # split train
-                traj_w_c.txt        # 4x4 camera to world in each line, one a frame; may be missing
+                traj_w_c.txt        # 4x4 camera to world in each line, one per frame; optional
                 rgb/rgb_0.png
                 depth/depth_0.png   # 16 bit, millimetres, 0 = no reading
             01/                     # split test: the same world
                 ...
-        camera.yaml                 # may be missing: then 1200x680, f 600, c 599.5 339.5
+        camera.yaml                 # optional: else 1200x680, f 600, c 599.5 339.5
 
 Layout: vMAP's Replica download (github.com/kxhit/vMAP, ``configs/Replica``); the split is SplaTAM's. Camera axes are
 OpenCV's. There are no stamps: the first frame is at 1 s, and the numbers in the names count at 30 Hz.
@@ -21,6 +21,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatam_core.datasets import base, files, replica
+from splatam_core.datasets.camera_file import camera_of
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, row_trajectory
 from splatam_core.errors import DatasetError
 
@@ -41,10 +42,10 @@ def read(folder: Path, *, split: str = 'train', width: int | None = None) -> Ima
     color = files.numbered(frames / 'rgb', r'rgb_(\d+)\.png')
     depth = files.numbered(frames / 'depth', r'depth_(\d+)\.png')
     pairs = pair_up(color, depth, frames, 'rgb/rgb_0.png with depth/depth_0.png')
-    camera = files.camera_of(folder, lambda: replica.CAMERA.calibration, DEPTH_SCALE)
+    camera = camera_of(folder, lambda: replica.CAMERA.calibration, DEPTH_SCALE)
     return ImagePairs(
         f'{folder.resolve().name}_{split}', pairs, camera.calibration, DepthFormat(camera.depth_scale),
-        width=width, truth=lambda: row_trajectory(frames / 'traj_w_c.txt', pairs, list(color)),
+        width=width, ground_truth=lambda: row_trajectory(frames / 'traj_w_c.txt', pairs, list(color)),
     )  # fmt: skip
 
 

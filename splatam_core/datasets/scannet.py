@@ -2,21 +2,21 @@
 
 ::
 
-    scene0000_00/                   # SOURCE; or with all of this in frames/
+    scene0000_00/                   # SOURCE; the files may also lie in frames/ below it
         color/0.jpg                 # 1296x968
         depth/0.png                 # 640x480, 16 bit, millimetres, 0 = no reading
-        pose/0.txt                  # 4x4 camera to world; -inf throughout where it was not tracked; may be missing
+        pose/0.txt                  # 4x4 camera to world; all -inf if tracking failed; optional
         intrinsic/
             intrinsic_color.txt     # 4x4
-            intrinsic_depth.txt     # 4x4; may be missing: then depth shows colour's view in its own size
-            extrinsic_color.txt     # 4x4; may be missing
+            intrinsic_depth.txt     # 4x4; optional: else depth is taken as colour's view at another size
+            extrinsic_color.txt     # 4x4; optional
             extrinsic_depth.txt
-        camera.yaml                 # may be missing; states colour's camera and wins
+        camera.yaml                 # optional; overrides the colour camera
 
-Layout: ``SensReader/python`` (github.com/ScanNet/ScanNet), run with every ``--export`` option. Depth is moved to the
-pixels of colour by both intrinsics; both are taken to look from the same place, and a warning says where the
-extrinsics differ. Camera axes are OpenCV's. Frames without a pose are kept, and have no truth. Stamps are not
-exported: the first frame is at 1 s, and the numbers in the names count at 30 Hz.
+Layout: ``SensReader/python`` (github.com/ScanNet/ScanNet), run with every ``--export`` option. Depth is
+resampled to colour's pixels with both intrinsics. Both cameras are assumed to be at the same place; a warning is logged
+if the extrinsics differ. Camera axes are OpenCV's. Frames without a pose are kept, and have no ground truth. Stamps are
+not exported: the first frame is at 1 s, and the numbers in the names count at 30 Hz.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from splatam_core.datasets import base, files
+from splatam_core.datasets.camera_file import camera_of
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.trajectory import Trajectory
@@ -48,20 +49,20 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     color = files.numbered(frames / 'color', r'(\d+)\.(?:jpg|png)')
     pairs = pair_up(color, files.numbered(frames / 'depth', r'(\d+)\.png'), frames, 'color/0.jpg with depth/0.png')
     path = frames / 'intrinsic' / 'intrinsic_color.txt'
-    camera = files.camera_of(
+    camera = camera_of(
         folder,
         lambda: files.calibration_from_matrix(files.read_matrix(path, 4, 3), files.image_size(pairs[0].color)),
         DEPTH_SCALE,
     )
     _warn_of_extrinsics(frames / 'intrinsic')
 
-    def truth() -> Trajectory | None:
+    def ground_truth() -> Trajectory | None:
         posed = files.numbered(frames / 'pose', r'(\d+)\.txt')
         return trajectory(pairs, [files.read_pose(posed[number]) if number in posed else None for number in color])
 
     depth_camera = _depth_camera(frames, camera.calibration.pinhole, pairs[0].depth)
     depth = DepthFormat(camera.depth_scale, camera=depth_camera)
-    return ImagePairs(folder.resolve().name, pairs, camera.calibration, depth, width=width, truth=truth)
+    return ImagePairs(folder.resolve().name, pairs, camera.calibration, depth, width=width, ground_truth=ground_truth)
 
 
 def _frames(folder: Path) -> Path:
@@ -79,7 +80,7 @@ def _warn_of_extrinsics(folder: Path) -> None:
     for name in ('extrinsic_color.txt', 'extrinsic_depth.txt'):
         path = folder / name
         if path.exists() and np.abs(files.read_matrix(path, 4) - np.eye(4)).max() > SAME_PLACE:
-            _log.warning('%s is not the identity: depth is used as if it were taken from where colour was', path)
+            _log.warning('%s is not the identity: depth is used as if it were measured from the colour camera', path)
 
 
 def _recognises(source: str) -> bool:

@@ -9,12 +9,12 @@
                                                     #   transform_matrix is_bad
             undistorted_images/DSC00001.JPG         # or resized_undistorted_images/
             undistorted_depths/DSC00001.png         # 16 bit, millimetres, rendered from the scan; 0 = no reading
-        camera.yaml                                 # may be missing; wins
+        camera.yaml                                 # optional; overrides
 
 Layout: kaldir.vc.in.tum.de/scannetpp/documentation and the toolkit (github.com/scannetpp/scannetpp): ``dslr.undistort``
-makes the images and the camera. Depth does not come with the dataset: ``common.render`` renders it from the scan's
-mesh, and SplaTAM's authors' fork undistorts it (github.com/Nik-V9/scannetpp). Poses have OpenGL's camera axes.
-``is_bad`` marks blurred frames: ``--skip-bad`` leaves them out. Photographs have no rate: frames come at 30 Hz, the
+makes the images and the camera. Depth is not part of the dataset: ``common.render`` renders it from the scan's
+mesh, and the fork of SplaTAM's authors undistorts it (github.com/Nik-V9/scannetpp). Poses have OpenGL's camera axes.
+``is_bad`` marks blurred frames, which ``--skip-bad`` skips. Photographs have no rate: frames come at 30 Hz, the
 first at 1 s.
 """
 
@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from splatam_core.datasets import base, files, nerfstudio
+from splatam_core.datasets.camera_file import camera_of
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
 from splatam_core.errors import DatasetError
 
@@ -45,7 +46,7 @@ def read(folder: Path, *, split: str = 'train', skip_bad: bool = False, width: i
     with files.parsing(path):
         stated = {frame['file_path']: frame for frame in transforms[FRAMES[split]]}
         frames = [frame for frame in _in_order(dslr, split, stated) if not (skip_bad and frame['is_bad'])]
-        camera = files.camera_of(folder, lambda: nerfstudio.calibration(transforms), DEPTH_SCALE)
+        camera = camera_of(folder, lambda: nerfstudio.calibration(transforms), DEPTH_SCALE)
         poses = [nerfstudio.pose(frame, f'{path}, {frame["file_path"]}') for frame in frames]
     names = [Path(frame['file_path']) for frame in frames]
     images = next((f for f in ('undistorted_images', 'resized_undistorted_images') if (dslr / f).is_dir()), None)
@@ -55,7 +56,7 @@ def read(folder: Path, *, split: str = 'train', skip_bad: bool = False, width: i
     pairs = pair_up(color, depth, dslr, 'undistorted_images/DSC00001.JPG with undistorted_depths/DSC00001.png')
     return ImagePairs(
         f'{folder.resolve().name}_{split}', pairs, camera.calibration, DepthFormat(camera.depth_scale),
-        width=width, truth=lambda: trajectory(pairs, poses),
+        width=width, ground_truth=lambda: trajectory(pairs, poses),
     )  # fmt: skip
 
 

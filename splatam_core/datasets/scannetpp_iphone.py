@@ -3,15 +3,15 @@
 ::
 
     8b5caf3398/iphone/                  # SOURCE
-        pose_intrinsic_imu.json         # by name (frame_000000): intrinsic (3x3), aligned_pose (4x4; may be missing)
+        pose_intrinsic_imu.json         # by name (frame_000000): intrinsic (3x3), aligned_pose (4x4; optional)
         rgb/frame_000000.jpg            # 1920x1440
         depth/frame_000000.png          # 256x192, 16 bit, millimetres, 0 = no reading
-        camera.yaml                     # may be missing; wins over the cameras in the JSON file
+        camera.yaml                     # optional; overrides the cameras in the JSON file
 
 Layout: kaldir.vc.in.tum.de/scannetpp/documentation; ``iphone.prepare_iphone_data`` of the toolkit
-(github.com/scannetpp/scannetpp) makes images and depth, ``iphone/arkit_pcl.py`` there shows how they belong together:
-``aligned_pose`` is camera to world with OpenCV's axes, depth is colour's view in another size. Each frame has a camera
-of its own: frames are rectified to the first one's. The numbers in the names count at 60 Hz, the first is at 1 s.
+(github.com/scannetpp/scannetpp) makes images and depth, and ``iphone/arkit_pcl.py`` there shows how they relate:
+``aligned_pose`` is camera to world with OpenCV's axes, depth is colour's view at another size. Intrinsics differ between
+frames; all frames are rectified to the first frame's camera. The numbers in the names count at 60 Hz, the first is at 1 s.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core.datasets import base, files
+from splatam_core.datasets.camera_file import camera_of
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
 
 DEPTH_SCALE = 1000.0
@@ -52,16 +53,16 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     own = None if (folder / 'camera.yaml').exists() else cameras
     expected = 'rgb/frame_000000.jpg with depth/frame_000000.png'
     pairs = pair_up(color, depth, folder, expected, rate_hz=RATE_HZ, calibrations=own)
-    camera = files.camera_of(folder, lambda: cameras[next(iter(color))], DEPTH_SCALE)
+    camera = camera_of(folder, lambda: cameras[next(iter(color))], DEPTH_SCALE)
     depth_format = DepthFormat(camera.depth_scale, size=files.image_size(pairs[0].depth))
     return ImagePairs(
         f'{folder.resolve().parent.name}_iphone', pairs, camera.calibration, depth_format,
-        width=width, truth=lambda: trajectory(pairs, poses),
+        width=width, ground_truth=lambda: trajectory(pairs, poses),
     )  # fmt: skip
 
 
 def _pose(frame: Mapping[str, Any], where: str) -> NDArray[np.float64] | None:
-    """A frame's pose; None where it has none."""
+    """Returns a frame's pose; None if it has none."""
     return files.pose(np.array(frame['aligned_pose'], np.float64), where) if 'aligned_pose' in frame else None
 
 

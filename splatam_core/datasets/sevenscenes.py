@@ -5,9 +5,9 @@
     seq-01/
         frame-000000.color.png      # or .color.jpg
         frame-000000.depth.png      # 16 bit, millimetres; 0 and 65535 = no reading
-        frame-000000.pose.txt       # 4x4 camera to world; may be missing
-        camera-intrinsics.txt       # 3x3 K; may be missing: then 585 585 320 240 at 640x480
-        camera.yaml                 # may be missing; wins over both
+        frame-000000.pose.txt       # 4x4 camera to world; optional
+        camera-intrinsics.txt       # 3x3 K; optional: else 585 585 320 240 at 640x480
+        camera.yaml                 # optional; overrides both
         ...
 
 There are no stamps: the first frame is at 1 s, and the numbers in the names count at 30 Hz.
@@ -18,6 +18,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatam_core.datasets import base, files
+from splatam_core.datasets.camera_file import camera_of
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 from splatam_core.geometry.trajectory import Trajectory
@@ -37,14 +38,14 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     color = files.numbered(folder, r'frame-(\d{6})\.color\.(?:png|jpg)')
     depth = files.numbered(folder, r'frame-(\d{6})\.depth\.png')
     pairs = pair_up(color, depth, folder, 'frame-000000.color.png (or .jpg) with frame-000000.depth.png')
-    camera = files.camera_of(folder, lambda: _calibration(folder, pairs[0].color), DEFAULT_DEPTH_SCALE)
+    camera = camera_of(folder, lambda: _calibration(folder, pairs[0].color), DEFAULT_DEPTH_SCALE)
 
-    def truth() -> Trajectory | None:
+    def ground_truth() -> Trajectory | None:
         posed = files.numbered(folder, r'frame-(\d{6})\.pose\.txt')
         return trajectory(pairs, [files.read_pose(posed[number]) if number in posed else None for number in color])
 
     depth_format = DepthFormat(camera.depth_scale, no_reading=NO_DEPTH)
-    return ImagePairs(folder.resolve().name, pairs, camera.calibration, depth_format, width=width, truth=truth)
+    return ImagePairs(folder.resolve().name, pairs, camera.calibration, depth_format, width=width, ground_truth=ground_truth)
 
 
 def _calibration(folder: Path, color: Path) -> CameraCalibration:

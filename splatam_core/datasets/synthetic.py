@@ -1,25 +1,25 @@
 """A synthetic room, seen by a hand-held RGB-D camera whose poses are known exactly.
 
-SOURCE is ``synthetic``, or ``synthetic:`` and options with commas between::
+SOURCE is ``synthetic``, or ``synthetic:`` with options separated by commas::
 
     synthetic:seed=3,noise=off,frames=600,motion=fast
 
 ``seed``
-    Which room and which walk through it (default 0). Frame i of a seed is the same whatever else is
-    asked for.
+    Selects the room and the walk through it (default 0). Frame i of a seed does not depend on how
+    many frames there are or which of them are read.
 ``noise``
-    ``on`` (default): depth is measured as by a Kinect, in whole millimetres. ``off``: exact depth.
+    ``on`` (default): depth has the noise of a Kinect, in whole millimetres. ``off``: exact depth.
 ``frames``
-    Length (default: as far as ``--max-frames`` asks, else 300). The walk closes its loop every 300
-    frames and then goes on along nearly the same way.
+    Length (default: as needed for ``--max-frames``, else 300). The walk closes a loop every 300
+    frames and then continues along nearly the same path.
 ``motion``
-    ``calm`` (default): a hand that looks around one side of the room. ``fast``: one that turns all the
-    way round in 120 frames, by 1 degree from frame to frame at the start and by 5 after 30 frames, so that
-    parts of the room that were never seen come into view all the time. That is soon farther than preset ``splatam`` can turn in a
-    frame's 40 steps (2 x 40 x 4e-4 rad = 1.8 degrees) unless it predicts the motion, and changes so
-    slowly that a prediction at constant velocity is within half a degree.
+    ``calm`` (default): the camera looks around one side of the room. ``fast``: the camera turns a full circle
+    in 120 frames, by 1 degree per frame at the start and by 5 degrees after 30 frames, so that unseen parts
+    of the room come into view all the time. Without a prediction of the motion, preset ``splatam`` cannot
+    follow: in a frame's 40 steps it turns by at most 2 x 40 x 4e-4 rad = 1.8 degrees. The rotation rate
+    changes slowly: a prediction at constant velocity is within half a degree.
 
-Frames are 640x480 unless ``--width`` says otherwise, which renders at that size instead of resizing.
+Frames are 640x480; with ``--width`` they are rendered at that size, not resized.
 There is no motion blur and no noise in the colours.
 """
 
@@ -40,14 +40,14 @@ from splatam_core.types import RgbdFrame
 
 CAMERA = PinholeCamera(640, 480, 525.0, 525.0, 319.5, 239.5)
 MOTIONS = {'calm': 300, 'fast': 120}
-"""Name of a motion to the frames its loop takes."""
+"""Number of frames in a loop, by the name of the motion."""
 LOOP_FRAMES = MOTIONS['calm']
 SCHEME = 'synthetic'
 OPTIONS = 'seed=N, noise=on|off, frames=N, motion=calm|fast'
 
 
 class SyntheticSequence:
-    """As many frames as asked of one walk through one room."""
+    """The frames of one walk through one room."""
 
     def __init__(
         self, *, seed: int = 0, noise: bool = True, frames: int = LOOP_FRAMES, width: int | None = None,
@@ -77,19 +77,19 @@ class SyntheticSequence:
         return RgbdFrame(base.nominal_stamp_ns(frame), rgb, depth_m, self.camera)
 
     def ground_truth(self) -> Trajectory:
-        """The pose of every frame, in the room's axes (z up)."""
+        """The pose of every frame in the room's axes (z up)."""
         stamps = np.array([base.nominal_stamp_ns(frame) for frame in self._frames], np.int64)
         return Trajectory(stamps, np.stack([self._walk.pose(frame) for frame in self._frames]))
 
 
 @dataclass(frozen=True, eq=False)
 class Walk:
-    """A hand-held camera's way: one loop through the room that looks around, and a hand that is never still.
+    """The path of a hand-held camera: a loop in which it looks around, plus the tremor of the hand.
 
     Attributes:
         motion: one of ``MOTIONS``.
-        phases: [4] radians, where on its way the camera begins.
-        tremor_hz: [6, 3] frequencies of the hand's motion along x, y, z and about yaw, pitch, roll.
+        phases: [4] radians, the position in the loop of the first frame.
+        tremor_hz: [6, 3] frequencies of the tremor along x, y, z and about yaw, pitch, roll.
         tremor_phases: [6, 3] radians.
     """
 
@@ -100,16 +100,16 @@ class Walk:
 
     @classmethod
     def of(cls, seed: int, motion: str = 'calm') -> Walk:
-        """The walk of a seed."""
+        """Returns the walk of a seed."""
         rng = np.random.default_rng([seed, 0])
         turn = 2 * np.pi
         phases = rng.uniform(0, turn, 4)
         if motion == 'fast':
-            phases[2] = np.pi / 2 if phases[2] < np.pi else 3 * np.pi / 2  # where it turns slowest
+            phases[2] = np.pi / 2 if phases[2] < np.pi else 3 * np.pi / 2  # start where it turns slowest
         return cls(motion, phases, rng.uniform(0.4, 2.2, (6, 3)), rng.uniform(0, turn, (6, 3)))
 
     def pose(self, frame: int) -> NDArray[np.float64]:
-        """[4, 4] camera to world. At most about 0.35 m/s and 25 degrees/s when calm, 0.8 m/s and 160 degrees/s when fast."""
+        """Returns the [4, 4] camera-to-world pose; up to 0.35 m/s and 25 degrees/s (calm), or 0.8 m/s and 160 degrees/s (fast)."""
         around = 2 * np.pi * frame / MOTIONS[self.motion] + self.phases
         seconds = frame / base.NOMINAL_RATE_HZ
         tremor = np.sin(2 * np.pi * self.tremor_hz * seconds + self.tremor_phases).mean(axis=1)
@@ -123,16 +123,16 @@ class Walk:
 
 
 def measured(depth_m: NDArray[np.float32], incidence: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
-    """Depth as a structured-light camera measures it.
+    """Simulate the depth measurement of a structured-light camera.
 
-    The error along the axis grows with the square of the depth (Khoshelham and Elberink 2012, 1.4 mm
+    The error along the optical axis grows with the square of the depth (Khoshelham and Elberink 2012, 1.4 mm
     at 1 m). There is no reading out of range, on surfaces seen at a grazing angle, and on most pixels
     at depth edges, where the pattern is in shadow. Readings are whole millimetres.
 
     Args:
         depth_m: [H, W] true depth.
         incidence: [H, W] cosine between ray and surface normal.
-        rng: decides the errors.
+        rng: generates the errors.
 
     Returns:
         [H, W] metres, 0 = no reading.
@@ -147,7 +147,7 @@ def measured(depth_m: NDArray[np.float32], incidence: NDArray[np.float32], rng: 
 
 
 def _depth_edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Pixels with a neighbour that is more than 4 % nearer or farther."""
+    """Returns True at pixels with a neighbour that is more than 4 % nearer or farther, [H, W]."""
     edges = np.zeros(depth_m.shape, bool)
     for axis in (0, 1):
         jump = np.abs(np.diff(np.log(depth_m), axis=axis)) > 0.04

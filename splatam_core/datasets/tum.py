@@ -5,12 +5,12 @@
     rgbd_dataset_freiburg1_xyz/
         rgb.txt             # stamp and path of each colour image, seconds; '#' starts a comment
         depth.txt           # the same for depth, 16-bit PNG, 5000 counts per metre, 0 = no reading
-        groundtruth.txt     # stamp tx ty tz qx qy qz qw, camera to world; may be missing
-        camera.yaml         # may be missing where the folder's name says freiburg1, 2, 3 (or fr1, fr2, fr3)
+        groundtruth.txt     # stamp tx ty tz qx qy qz qw, camera to world; optional
+        camera.yaml         # optional if the folder's name contains freiburg1, 2, 3 (or fr1, fr2, fr3)
         rgb/  depth/
 
-A colour image is paired with the depth image nearest in time, at most 20 ms away, and each depth
-image is used at most once; colour images left without a partner are skipped. The frame has the
+A colour image is paired with the depth image nearest in time, at most 20 ms away. Each depth
+image is used at most once, and colour images without a partner are skipped. The frame has the
 colour image's stamp.
 """
 
@@ -23,7 +23,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core.datasets import base, files
+from splatam_core.datasets import base
+from splatam_core.datasets.camera_file import camera_of
 from splatam_core.datasets.pairs import DepthFormat, ImagePair, ImagePairs
 from splatam_core.errors import DatasetError
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
@@ -43,7 +44,7 @@ KNOWN_CAMERAS = {
     ),
     '3': CameraCalibration(PinholeCamera(640, 480, 535.4, 539.2, 320.1, 247.6)),
 }  # fmt: skip
-"""The calibrations published with the dataset; freiburg3 images are rectified already."""
+"""The calibrations published with the dataset; freiburg3 images are already rectified."""
 
 
 def read(folder: Path, *, width: int | None = None, max_interval_ns: int = MAX_INTERVAL_NS) -> ImagePairs:
@@ -53,16 +54,16 @@ def read(folder: Path, *, width: int | None = None, max_interval_ns: int = MAX_I
         DatasetError: a list is missing or broken, no images pair up, or the camera is unknown.
         CameraError: its ``camera.yaml`` cannot be used.
     """
-    camera = files.camera_of(folder, lambda: _known_camera(folder), DEFAULT_DEPTH_SCALE)
-    truth = folder / 'groundtruth.txt'
+    camera = camera_of(folder, lambda: _known_camera(folder), DEFAULT_DEPTH_SCALE)
+    path = folder / 'groundtruth.txt'
     return ImagePairs(
         folder.resolve().name, _pairs(folder, max_interval_ns), camera.calibration, DepthFormat(camera.depth_scale),
-        width=width, truth=lambda: read_trajectory(truth) if truth.exists() else None,
+        width=width, ground_truth=lambda: read_trajectory(path) if path.exists() else None,
     )  # fmt: skip
 
 
 def associate(a_ns: NDArray[np.int64], b_ns: NDArray[np.int64], max_interval_ns: int) -> list[tuple[int, int]]:
-    """Pair two lists of increasing stamps, the nearest pairs first, each stamp in one pair at most.
+    """Pair two lists of increasing stamps, nearest pairs first; each stamp is in at most one pair.
 
     Returns:
         Indices into both lists, in the order of the first.
@@ -80,11 +81,11 @@ def associate(a_ns: NDArray[np.int64], b_ns: NDArray[np.int64], max_interval_ns:
 
 
 def _known_camera(folder: Path) -> CameraCalibration:
-    """The published calibration of the camera that the folder's name says."""
+    """Returns the published calibration of the camera in the folder's name."""
     match = re.search(r'(?<![a-z])(?:freiburg|fr)([123])(?!\d)', folder.resolve().name.lower())
     if match is None:
         raise DatasetError(
-            f"{folder}: the camera is unknown, for the folder's name does not say freiburg1, freiburg2 or freiburg3; "
+            f"{folder}: the camera is unknown, because the folder's name does not contain freiburg1, freiburg2 or freiburg3; "
             'put a camera.yaml with width, height, fx, fy, cx, cy into the folder'
         )
     return KNOWN_CAMERAS[match.group(1)]
@@ -96,7 +97,7 @@ def _pairs(folder: Path, max_interval_ns: int) -> list[ImagePair]:
     if not pairs:
         raise DatasetError(
             f'{folder}: none of {len(rgb)} colour and {len(depth)} depth images are within '
-            f'{max_interval_ns / 1e6:g} ms of each other; are both lists stamped by the same clock?'
+            f'{max_interval_ns / 1e6:g} ms of each other; do the stamps of both lists come from the same clock?'
         )
     return [ImagePair(rgb[i][0], folder / rgb[i][1], folder / depth[j][1]) for i, j in pairs]
 
@@ -106,7 +107,7 @@ def _stamps_ns(rows: list[tuple[int, str]]) -> NDArray[np.int64]:
 
 
 def _read_list(path: Path) -> list[tuple[int, str]]:
-    """Rows of (stamp_ns, path), in increasing time."""
+    """Returns rows of (stamp_ns, path) with increasing stamps."""
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:

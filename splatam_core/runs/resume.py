@@ -9,7 +9,7 @@ from pathlib import Path
 
 from splatam_core.config import WHERE, SlamConfig, computed_on, flat_values
 from splatam_core.datasets.base import Sequence as FrameSequence
-from splatam_core.datasets.known_poses import FramesWithTruth
+from splatam_core.datasets.known_poses import FramesWithGroundTruth
 from splatam_core.errors import CheckpointError
 from splatam_core.runs import provenance
 from splatam_core.runs.checkpoints import Checkpoint, Checkpoints, Progress, read_newest
@@ -32,7 +32,7 @@ def prepare(sequence: FrameSequence, config: SlamConfig) -> tuple[FrameSequence,
     """
     if config.tracking.method != 'truth':
         return sequence, Slam(config, num_frames=len(sequence))
-    frames = FramesWithTruth(sequence)
+    frames = FramesWithGroundTruth(sequence)
     return frames, Slam(config, true_motion=frames.motion, num_frames=len(frames))
 
 

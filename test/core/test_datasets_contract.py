@@ -283,7 +283,7 @@ def test_published_cameras():
 def test_published_camera_without_a_camera_file(tmp_path, name, size):
     source = write(name, tmp_path)
     (source / 'camera.yaml').unlink()
-    with pytest.raises(DatasetError, match=f'is 96x72, but the camera is that of {size[0]}x{size[1]} images; .*camera.yaml'):
+    with pytest.raises(DatasetError, match=f'is 96x72, but the camera is for {size[0]}x{size[1]} images; .*camera.yaml'):
         read(source, LAYOUTS[name])
     for path in (*source.rglob('rgb/*.png'), *source.rglob('depth/*.png')):
         cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), size, interpolation=cv2.INTER_NEAREST))

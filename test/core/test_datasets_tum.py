@@ -79,7 +79,7 @@ def test_nothing_pairs(tmp_path):
 )
 def test_known_camera_by_folder_name(tmp_path, name, number):
     folder = write_tum(tmp_path / name, [1.0], [1.0], camera=None)
-    with pytest.raises(DatasetError, match=r'rgb/0\.png: is 64x48, but the camera is that of 640x480 images'):
+    with pytest.raises(DatasetError, match=r'rgb/0\.png: is 64x48, but the camera is for 640x480 images'):
         tum.read(folder)
     cv2.imwrite(str(folder / 'rgb/0.png'), np.zeros((480, 640, 3), np.uint8))
     assert tum.read(folder).camera == KNOWN_CAMERAS[number].pinhole

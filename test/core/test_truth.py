@@ -9,7 +9,7 @@ import pytest
 
 from splatam_core.cli import main
 from splatam_core.config import PaperTrackingConfig, TrackingConfig, load_config
-from splatam_core.datasets.known_poses import FramesWithTruth
+from splatam_core.datasets.known_poses import FramesWithGroundTruth
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.errors import ConfigError, FrameError
 from splatam_core.geometry import se3
@@ -60,7 +60,7 @@ def test_frames_between_true_poses_get_the_pose_between(room) -> None:
     sequence = room(frames=3, width=WIDTH)
     stamps = sequence.ground_truth().stamps_ns
     ends = np.stack([np.eye(4), se3.exp(np.array([0.2, 0, 0, 0, 0.4, 0]))])
-    frames = FramesWithTruth(Recording(Trajectory(stamps[[0, 2]], ends)))
+    frames = FramesWithGroundTruth(Recording(Trajectory(stamps[[0, 2]], ends)))
     half = frames.motion(int(stamps[0]), int(stamps[1]))
     np.testing.assert_allclose(half, se3.exp(np.array([0.1, 0, 0, 0, 0.2, 0])), atol=1e-6)  # stamps are whole ns
     assert frames[2].stamp_ns == stamps[2]
@@ -69,12 +69,12 @@ def test_frames_between_true_poses_get_the_pose_between(room) -> None:
 
 
 def test_without_truth_there_are_no_true_poses() -> None:
-    with pytest.raises(ConfigError, match='recording has no true poses; choose render_and_compare'):
-        FramesWithTruth(Recording(None))
-    with pytest.raises(ConfigError, match='there are no true poses here'):
+    with pytest.raises(ConfigError, match='recording has no ground truth; choose render_and_compare'):
+        FramesWithGroundTruth(Recording(None))
+    with pytest.raises(ConfigError, match='there is no ground truth here'):
         Slam(load_config('quick', ['tracking.method=truth']))
     slam = Slam(load_config('quick'))
-    with pytest.raises(ConfigError, match='there are no true poses here'):
+    with pytest.raises(ConfigError, match='there is no ground truth here'):
         slam.configure(load_config('quick', ['tracking.method=truth']))
 
 

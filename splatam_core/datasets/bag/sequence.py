@@ -37,8 +37,7 @@ from splatam_core.datasets.bag.recording import Recording
 from splatam_core.datasets.bag.storage import is_bag
 from splatam_core.datasets.bag.topics import choose_topics
 from splatam_core.datasets.base import BagTopics, Format, ReadOptions
-from splatam_core.datasets.camera_file import CameraFile
-from splatam_core.datasets.files import camera_file
+from splatam_core.datasets.camera_file import CameraFile, find_camera_file
 from splatam_core.errors import DatasetError, FrameError
 from splatam_core.geometry.trajectory import Trajectory, stamp_text
 from splatam_core.images.rectification import FrameFactory
@@ -59,7 +58,7 @@ class BagSequence:
             CameraError: the camera cannot be used.
         """
         recording = Recording(path)
-        stated = camera_file(path if path.is_dir() else path.parent)
+        stated = find_camera_file(path if path.is_dir() else path.parent)
         chosen = choose_topics(recording, topics or BagTopics(), need_info=stated is None)
         index = read_index(recording, chosen)
         self._frames = FrameFactory(stated.calibration if stated else index.calibration(), width)

@@ -1,4 +1,4 @@
-"""The room behind the synthetic recordings: surfaces, paint, light, furniture, and a ray caster."""
+"""The room of the synthetic recordings: surfaces, paint, light, furniture and a ray caster."""
 
 from splatam_core.datasets.room.caster import Cast, Room, build_room
 from splatam_core.datasets.room.furniture import ROOM_SIZE_M

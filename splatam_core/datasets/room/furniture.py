@@ -1,4 +1,4 @@
-"""What is in the room, and where. Lengths are metres, angles radians; the origin is the middle of the floor."""
+"""The contents of the room and their positions. Lengths are metres, angles radians; the origin is the floor's centre."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Triple = tuple[float, float, float]
 
 
 def shell() -> list[Surface]:
-    """Floor, ceiling and four walls, the rug, and what hangs on the walls."""
+    """Returns floor, ceiling, four walls, the rug, and the pictures and the window on the walls."""
     x, y, z = ROOM_SIZE_M
     wallpaper = partial(textures.wallpaper, base=(0.72, 0.74, 0.66), motif=(0.35, 0.46, 0.42))
     warm, cool = partial(textures.plaster, base=(0.82, 0.72, 0.58)), partial(textures.plaster, base=(0.66, 0.74, 0.8))
@@ -32,7 +32,7 @@ def shell() -> list[Surface]:
         Rectangle(east, -Y, -Z, y, z, cool),
         Rectangle(west, Y, -Z, y, z, cool),
         Rectangle(np.array([-1.3, 0.9, 0.004]), X, -Y, 2.6, 1.9, textures.rug),
-        _hung(west, Y, 1.2, 0.6, 1.5, 1.1, textures.window),
+        _hung(west, Y, 1.2, 0.6, 1.5, 1.1, paint=textures.window),
         _hung(north, X, 1.9, 0.55, 0.9, 0.65),
         _hung(north, X, 0.35, 0.5, 0.5, 0.7),
         _hung(east, -Y, 0.5, 0.6, 0.7, 0.9),
@@ -44,12 +44,12 @@ def shell() -> list[Surface]:
 
 
 def boxes(rng: np.random.Generator) -> list[Box]:
-    """A desk with things on it, a bookcase, a sofa, a cupboard, parcels, a sideboard."""
+    """Returns a desk with things on it, a bookcase, a sofa, a cupboard, parcels and a sideboard."""
     return [*_desk(), *_on_desk(), *_book_pile(rng), _bookcase(), *_sofa(rng), *_cupboard(rng), *_along_walls(rng)]
 
 
 def spheres() -> list[Sphere]:
-    """A globe on the desk, a ball on the cupboard, two on the floor."""
+    """Returns a globe on the desk, a ball on the cupboard, and two balls on the floor."""
     return [
         _ball((0.12, 1.42, DESK_TOP + 0.13), 0.13, (0.25, 0.45, 0.75), (0.8, 0.72, 0.45), 0.002),
         _ball((1.95, -0.5, CUPBOARD_TOP + 0.15), 0.15, (0.6, 0.2, 0.45), (0.85, 0.8, 0.85)),
@@ -112,7 +112,7 @@ def _sofa(rng: np.random.Generator) -> list[Box]:
 
 
 def _cupboard(rng: np.random.Generator) -> list[Box]:
-    """With a parcel and a framed picture on it."""
+    """A cupboard with a parcel and a framed picture on it."""
     doors = partial(textures.wood, base=(0.7, 0.55, 0.36))
     return [
         _box((2.2, -0.6, CUPBOARD_TOP / 2), (0.5, 1.5, CUPBOARD_TOP), doors),
@@ -133,11 +133,11 @@ def _along_walls(rng: np.random.Generator) -> list[Box]:
 
 
 def _hung(
-    wall: Array, right: Array, across: float, down: float, width: float, height: float, paint: Paint = textures.painting
+    wall: Array, right: Array, across: float, down: float, width: float, height: float, *, paint: Paint = textures.painting
 ) -> Rectangle:
-    """Something flat on a wall, placed from the wall's upper left corner; 4 mm in front of it."""
+    """A flat object 4 mm in front of a wall, positioned relative to the wall's upper left corner."""
     corner = wall + across * right - down * Z + 0.004 * np.cross(-Z, right)
-    return Rectangle(corner, right, -Z, width, height, paint, 0.003)
+    return Rectangle(corner, right, -Z, width, height, paint=paint, texel_m=0.003)
 
 
 def _box(

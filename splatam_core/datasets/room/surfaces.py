@@ -1,4 +1,4 @@
-"""What a room is made of, rectangles and balls, and where a camera's rays meet them.
+"""The surfaces of a room, rectangles and spheres, and the intersections of a camera's rays with them.
 
 World axes: x to the right, y forward, z up.
 """
@@ -24,14 +24,14 @@ NEAR_M = 0.05
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A one-sided rectangle: seen from where its normal points.
+    """A one-sided rectangle, visible from the side to which its normal points.
 
     Attributes:
         corner: [3] metres.
         right, down: [3] unit vectors along its sides; the normal is ``down x right``.
         width, height: metres.
-        paint: what is on it.
-        texel_m: size of one texel of the paint.
+        paint: makes its texture.
+        texel_m: size of one texel of the texture.
     """
 
     corner: Array
@@ -49,16 +49,16 @@ class Rectangle:
 
     @property
     def size_texels(self) -> tuple[int, int]:
-        """Width and height of its paint."""
+        """Width and height of its texture."""
         return max(round(self.width / self.texel_m), 2), max(round(self.height / self.texel_m), 2)
 
     def points(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Points and normals, [N, 3] each, at fractions u, v of the sides."""
+        """Returns points and normals, [N, 3] each, at fractions u, v of the sides."""
         points = self.corner + u[:, None] * self.width * self.right + v[:, None] * self.height * self.down
         return points, np.broadcast_to(self.normal, points.shape)
 
     def intersect(self, view: View, region: Region) -> Hits | None:
-        """Where the rays of a region meet it: depth along the axis (inf where they do not) and u, v."""
+        """Intersect with the rays of a region: depth along the optical axis (inf = no hit) and u, v; None if none hits."""
         corner = view.to_camera(self.corner)
         normal, right, down = (view.rotate(axis) for axis in (self.normal, self.right, self.down))
         distance = float(normal @ corner)
@@ -72,25 +72,25 @@ class Rectangle:
         return Hits(np.where(inside, depth, np.float32(np.inf)), u, v)
 
     def incidence(self, view: View) -> Image:
-        """Cosine between each ray of a view and the normal behind it, [H, W]; only of use where a ray meets it."""
+        """Returns the cosine between each ray of a view and the normal, [H, W]; meaningful only where the ray hits."""
         x, y = view.rays(view.whole)
         return -_dot(view.rotate(self.normal), x, y) / np.sqrt(x * x + y * y + np.float32(1))
 
     def outline(self) -> Array:
-        """Its corners, [8, 3]; each twice, to have as many as a box."""
+        """Returns its corners, [8, 3]: each one twice, to have as many as a box."""
         right, down = self.right * self.width, self.down * self.height
         return self.corner + np.array([np.zeros(3), right, down, right + down] * 2)
 
 
 @dataclass(frozen=True)
 class Sphere:
-    """A ball.
+    """A sphere.
 
     Attributes:
         center: [3] metres.
         radius: metres.
-        paint: what is on it, in longitude and latitude.
-        texel_m: size of one texel of the paint at the equator.
+        paint: makes its texture in longitude and latitude.
+        texel_m: size of one texel at the equator.
     """
 
     center: Array
@@ -100,19 +100,19 @@ class Sphere:
 
     @property
     def size_texels(self) -> tuple[int, int]:
-        """Width and height of its paint."""
+        """Width and height of its texture."""
         around = 2 * np.pi * self.radius / self.texel_m
         return round(around), round(around / 2)
 
     def points(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Points and normals, [N, 3] each, at fractions u of the longitude and v of the latitude."""
+        """Returns points and normals, [N, 3] each, at fractions u of the longitude and v of the colatitude."""
         longitude, colatitude = 2 * np.pi * u - np.pi, np.pi * v
         sine = np.sin(colatitude)
         normals = np.stack([sine * np.cos(longitude), sine * np.sin(longitude), np.cos(colatitude)], -1)
         return self.center + self.radius * normals, normals
 
     def intersect(self, view: View, region: Region) -> Hits | None:
-        """Where the rays of a region meet it: depth along the axis (inf where they do not) and u, v."""
+        """Intersect with the rays of a region: depth along the optical axis (inf = no hit) and u, v; None if none hits."""
         center = view.to_camera(self.center)
         x, y = view.rays(region)
         a = x * x + y * y + np.float32(1)
@@ -126,7 +126,7 @@ class Sphere:
         return Hits(np.where((discriminant > 0) & (depth > NEAR_M), depth, np.float32(np.inf)), u, v)
 
     def incidence(self, view: View) -> Image:
-        """Cosine between each ray of a view and the normal behind it, [H, W]; only of use where a ray meets it."""
+        """Returns the cosine between each ray of a view and the normal, [H, W]; meaningful only where the ray hits."""
         x, y = view.rays(view.whole)
         center = view.to_camera(self.center)
         along = _dot(center, x, y) / np.sqrt(x * x + y * y + np.float32(1))
@@ -134,9 +134,9 @@ class Sphere:
         return np.sqrt(np.clip(1 - missed_by, 0, 1))
 
     def shades(self, starts: Image, step: Image) -> NDArray[np.bool_]:
-        """Which of the segments from ``starts``, [3, N], along ``step``, [3, N], pass through it.
+        """Returns which of the segments from ``starts``, [3, N], along ``step``, [3, N], pass through it, [N].
 
-        Not those that start on it: the angle of its own surface to the light darkens those.
+        Segments that start on it do not count: the cosine of incidence already darkens its own far side.
         """
         offset = self.center.astype(np.float32)[:, None] - starts
         along = np.clip((offset * step).sum(axis=0) / (step * step).sum(axis=0), 0, 1)
@@ -144,7 +144,7 @@ class Sphere:
         return near & ((offset * offset).sum(axis=0) > (1.05 * self.radius) ** 2)
 
     def outline(self) -> Array:
-        """The corners of a box around it, [8, 3]."""
+        """Returns the corners of its bounding box, [8, 3]."""
         signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
         return self.center + self.radius * signs
 
@@ -154,14 +154,14 @@ Surface = Rectangle | Sphere
 
 @dataclass(frozen=True)
 class Box:
-    """A solid that stands upright, turned about the vertical.
+    """An upright solid, rotated about the vertical.
 
     Attributes:
         center: [3] metres.
         size: [3] metres.
         yaw: radians.
-        paints: of the front (-y), back, left (-x), right, top and bottom.
-        texel_m: size of one texel of the paints.
+        paints: make the textures of the front (-y), back, left (-x), right, top and bottom.
+        texel_m: size of one texel.
     """
 
     center: Array
@@ -172,21 +172,21 @@ class Box:
 
     @cached_property
     def axes(self) -> Array:
-        """Its own x, y and z axis as the rows of a [3, 3]."""
+        """Its x, y and z axes as the rows of a [3, 3] matrix."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
     def faces(self) -> Iterator[Rectangle]:
-        """Its six sides, seen from outside."""
+        """Yield its six sides, visible from outside."""
         x, y, z = self.axes
         sides = [(x, -z, -y), (-x, -z, y), (-y, -z, -x), (y, -z, x), (x, -y, z), (x, y, -z)]
         for (right, down, outward), paint in zip(sides, self.paints):
             width, height, depth = (float(np.abs(self.axes @ axis) @ self.size) for axis in (right, down, outward))
             corner = self.center + (outward * depth - right * width - down * height) / 2
-            yield Rectangle(corner, right, down, width, height, paint, self.texel_m)
+            yield Rectangle(corner, right, down, width, height, paint=paint, texel_m=self.texel_m)
 
     def shades(self, starts: Image, step: Image) -> NDArray[np.bool_]:
-        """Which of the segments from ``starts``, [3, N], along ``step``, [3, N], pass through it."""
+        """Returns which of the segments from ``starts``, [3, N], along ``step``, [3, N], pass through it, [N]."""
         axes = self.axes.astype(np.float32)
         start = axes @ (starts - self.center.astype(np.float32)[:, None])
         along = axes @ step
@@ -200,7 +200,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Region:
-    """Columns and rows of an image, half-open."""
+    """A range of columns and rows of an image; right and bottom are exclusive."""
 
     left: int
     right: int
@@ -210,7 +210,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays meet a surface, [h, w] each: depth in metres, and fractions of the surface's sides."""
+    """Intersections of rays with a surface, [h, w] each: depth in metres, and fractions u, v of the surface's sides."""
 
     depth: Image
     u: Image
@@ -233,7 +233,7 @@ class View:
         return ((np.arange(self.camera.height) - self.camera.cy) / self.camera.fy).astype(np.float32)[:, None]
 
     def rays(self, region: Region) -> tuple[Image, Image]:
-        """The x of the region's rays as a row, and their y as a column."""
+        """Returns the x of the region's rays as a row, and their y as a column."""
         return self._columns[:, region.left : region.right], self._rows[region.top : region.bottom]
 
     @property
@@ -242,15 +242,15 @@ class View:
         return Region(0, self.camera.width, 0, self.camera.height)
 
     def rotate(self, vector: Array) -> Array:
-        """A direction in camera axes."""
+        """Rotate a direction into camera axes."""
         return self.T_world_cam[:3, :3].T @ vector
 
     def to_camera(self, point: Array) -> Array:
-        """Points [..., 3] in camera axes."""
+        """Transform points [..., 3] into camera axes."""
         return (point - self.T_world_cam[:3, 3]) @ self.T_world_cam[:3, :3]
 
     def regions_of(self, outlines: Array) -> dict[int, Region]:
-        """Where in the image the surfaces can be seen, by index; those out of sight are left out.
+        """Returns the image regions of the surfaces by index; surfaces out of view are omitted.
 
         Args:
             outlines: [S, 8, 3] corners, world axes.
@@ -270,7 +270,7 @@ class View:
 
 
 def look_at(eye: Array, target: Array, roll: float) -> Array:
-    """Camera-to-world pose at ``eye`` that sees ``target`` in the middle, turned about its axis by ``roll`` radians."""
+    """Returns a camera-to-world pose at ``eye`` that looks at ``target``, rotated about its axis by ``roll`` radians."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -281,21 +281,21 @@ def look_at(eye: Array, target: Array, roll: float) -> Array:
 
 
 def _dot(vector: Array, x: Image, y: Image) -> Image:
-    """``vector`` times each ray (x, y, 1), where x is a row and y a column."""
+    """Returns the dot product of ``vector`` with each ray (x, y, 1), where x is a row and y a column."""
     a, b, c = (np.float32(value) for value in vector)
     return a * x + (b * y + c)
 
 
 def _clip_near(corners: Array) -> Array:
-    """The corners of a solid or polygon, [8, 3], with those before the near plane moved onto it.
+    """Returns the corners of a solid or polygon, [8, 3], with corners in front of the near plane moved onto it.
 
-    Each is moved along the lines to all the others; the two farthest apart stand for the rest. That bounds the
-    part beyond the plane, if not tightly.
+    A corner moves along its lines to the corners beyond the plane. Of all results, only the extreme ones in the image
+    are kept, which bound the visible part, though not tightly.
     """
     hidden, visible = corners[corners[:, 2] < NEAR_M], corners[corners[:, 2] >= NEAR_M]
     along = (NEAR_M - hidden[:, None, 2]) / (visible[None, :, 2] - hidden[:, None, 2])
     moved = hidden[:, None] + along[..., None] * (visible[None] - hidden[:, None])
     every = np.concatenate([visible, moved.reshape(-1, 3)])
-    slopes = every[:, :2] / every[:, 2:]
-    extremes = [*slopes.argmin(axis=0), *slopes.argmax(axis=0)]
+    projected = every[:, :2] / every[:, 2:]
+    extremes = [*projected.argmin(axis=0), *projected.argmax(axis=0)]
     return every[np.array(extremes * 2)]

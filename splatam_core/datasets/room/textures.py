@@ -1,7 +1,7 @@
-"""Procedural paint for the synthetic room: every function returns [h, w, 3] float32 colours in [0, 1].
+"""Procedural textures of the synthetic room: every function returns [h, w, 3] float32 colours in [0, 1].
 
-Each mixes detail from decimetres down to single texels, so that a tracker finds something to hold
-at any distance. The generator alone decides the result.
+Each texture has detail from decimetres down to single texels, so that tracking finds structure
+at any distance. The result depends only on the random generator and the arguments.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ PIGMENTS = np.array(
     ],
     np.float32,
 )  # fmt: skip
-"""What covers, spines and pictures are printed with."""
+"""Colours of book covers, book spines and pictures."""
 
 
 def noise(rng: np.random.Generator, height: int, width: int, *, coarsest: int = 64, gain: float = 0.7) -> Paint:
-    """Smooth noise of many scales, [h, w], zero mean and unit variance.
+    """Returns smooth multi-scale noise, [h, w], with zero mean and unit variance.
 
     Args:
-        rng: decides the noise.
-        height: rows.
-        width: columns.
-        coarsest: size of the largest blobs in texels; each octave below has half of it.
-        gain: amplitude of an octave over that of the next coarser one.
+        rng: generates the noise.
+        height: number of rows.
+        width: number of columns.
+        coarsest: size of the largest blobs in texels; every further octave has half the size.
+        gain: ratio of an octave's amplitude to that of the next coarser one.
     """
     total = np.zeros((height, width), np.float32)
     cell, amplitude = coarsest, 1.0
@@ -48,13 +48,13 @@ def noise(rng: np.random.Generator, height: int, width: int, *, coarsest: int = 
 
 
 def pigment(rng: np.random.Generator) -> Color:
-    """One of the pigments, mixed a little lighter or darker."""
+    """Returns one of the pigments, made a little lighter or darker."""
     red, green, blue = np.clip(PIGMENTS[rng.integers(len(PIGMENTS))] * rng.uniform(0.7, 1.15), 0, 1)
     return float(red), float(green), float(blue)
 
 
 def tinted(base: Color, *shades: Paint) -> Paint:
-    """A base colour made lighter and darker by the sum of some [h, w] shades."""
+    """Returns a base colour made lighter and darker by the sum of [h, w] shades."""
     return np.clip(_rgb(base) * (1 + reduce(np.add, shades)[..., None]), 0, 1).astype(np.float32)
 
 
@@ -166,7 +166,10 @@ def painting(rng: np.random.Generator, height: int, width: int) -> Paint:
     for size in np.geomspace(0.45, 0.03, 60) * min(height, width):
         center = (int(rng.integers(0, width)), int(rng.integers(0, height)))
         axes = (max(int(size * rng.uniform(0.3, 1)), 2), max(int(size * rng.uniform(0.2, 0.7)), 2))
-        cv2.ellipse(canvas, center, axes, float(rng.uniform(0, 180)), 0, 360, pigment(rng), -1, cv2.LINE_AA)
+        cv2.ellipse(
+            canvas, center, axes, angle=float(rng.uniform(0, 180)), startAngle=0, endAngle=360,
+            color=pigment(rng), thickness=-1, lineType=cv2.LINE_AA,
+        )  # fmt: skip
     canvas *= 1 + 0.1 * noise(rng, height, width, coarsest=16, gain=0.9)[..., None]
     _frame(canvas, 14, (0.2, 0.13, 0.08))
     return np.clip(canvas, 0, 1)
