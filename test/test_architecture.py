@@ -24,7 +24,7 @@ MESSAGES = {
 }  # fmt: skip
 MAY_IMPORT = {
     'msg_adapters': {'cv2', 'msg_adapters', 'numpy'},
-    'splatam_core': {'cv2', 'matplotlib', 'numpy', 'splatam_core', 'torch', 'tqdm', 'yaml'},
+    'splatam_core': {'cv2', 'jinja2', 'matplotlib', 'numpy', 'splatam_core', 'torch', 'tqdm', 'yaml'},
     'splatam_ros': {
         'ament_index_python', 'launch', 'launch_ros', 'msg_adapters', 'numpy', 'rclpy', 'rosbags', 'splatam_core',
         'splatam_ros', 'tqdm', 'yaml', *MESSAGES,

@@ -21,7 +21,7 @@ from splatam_core.errors import DatasetError, RunFolderError, SplatamError
 
 if TYPE_CHECKING:
     from splatam_core.datasets.base import Sequence
-    from splatam_core.evaluation.score import NovelViews
+    from splatam_core.evaluation.results import NovelViews
     from splatam_core.geometry.trajectory import Trajectory
     from splatam_core.runs.metrics import Metrics
     from splatam_core.runs.record import RunRecord
@@ -35,7 +35,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--every', type=positive, default=1, metavar='N', help='score the images of every n-th frame only')
     parser.add_argument(
         '--novel-views', nargs='?', choices=('trajectory', 'first'), const='trajectory', metavar='ALIGNMENT',
-        help="also score the test split of the run's dataset at its true poses; ALIGNMENT to the map is by the whole "
+        help="also score the test split of the run's dataset at its ground-truth poses; ALIGNMENT to the map is by the whole "
         "'trajectory' (default) or by its 'first' pose, as the original does",
     )  # fmt: skip
 
@@ -70,7 +70,8 @@ def score(
     from splatam_core.evaluation.report.frame_table import write_frame_table
     from splatam_core.evaluation.report.html import write_html
     from splatam_core.evaluation.report.picture import write_report
-    from splatam_core.evaluation.score import combine, score_images, score_trajectory
+    from splatam_core.evaluation.results import combine
+    from splatam_core.evaluation.score import score_images, score_trajectory
     from splatam_core.runs.layout import METRICS, PAGE, REPORT, SCORES
 
     against_truth = None if truth is None else score_trajectory(run, truth)

@@ -1,1 +1,1 @@
-"""Scores of a run: trajectory against truth, renders against images, and the report that shows both."""
+"""Scores of a run: its trajectory against the ground truth, and renders of its map against the frames."""

@@ -1,8 +1,9 @@
-"""How well the map's renders match the images, over the pixels that have a depth reading, and as the original counts.
+"""Image metrics: how well renders of the map match the frames.
 
-A pixel without a reading is one the map was never told about. It is left out of the sums, not set to zero on both
-sides, which would count it as a perfect one. SplaTAM's own evaluation does the latter: ``OriginalScores`` are for
-comparing with its tables. docs/evaluation.md defines each score.
+Each frame gets two sets of scores. ``ImageScores`` average over the pixels with a depth reading and leave the others
+out, because the map has no information about them. ``OriginalScores`` repeat SplaTAM's own evaluation, which blacks out
+those pixels in both images and averages over all pixels, so that each of them counts as perfect; they are for comparison
+with its tables. docs/evaluation.md defines each score.
 """
 
 from __future__ import annotations
@@ -27,11 +28,13 @@ from splatam_core.runs.metrics import ImageScores, OriginalScores
 from splatam_core.types import RgbdFrame
 
 MIN_SQUARED_ERROR = 1e-10
-"""Identical images score 100 dB, not infinity: that is no number in JSON, nor can it be averaged."""
+"""Limits PSNR to 100 dB: infinity is not valid JSON and has no mean."""
 
 HOLE_SILHOUETTE = 0.5
+"""A pixel with a depth reading and at most this silhouette is a hole: the map does not cover it."""
+
 MAX_HOLE_SHARE = 0.001
-"""A novel view with a larger share of holes shows what was never mapped, not how well it was (the original's limit)."""
+"""A novel view with a larger share of holes shows unmapped surface, and is scored separately (the original's limit)."""
 
 ImageDistance = Callable[[Tensor, Tensor], 'float | None']
 Scores = TypeVar('Scores', 'ImageScores', 'OriginalScores')
@@ -43,9 +46,9 @@ class FrameScores:
 
     Attributes:
         stamp_ns: the frame's stamp.
-        scores: how its render matches.
-        original: the same as the original counts.
-        hole_share: share of the pixels that have a reading and see no map.
+        scores: how well the render matches the frame.
+        original: the same as the original computes it.
+        hole_share: share of all pixels that are holes.
     """
 
     stamp_ns: int
@@ -55,19 +58,19 @@ class FrameScores:
 
     @property
     def has_holes(self) -> bool:
-        """Whether it sees more unmapped surface than the novel-view protocol lets pass."""
+        """True if the view has more holes than the novel-view protocol allows."""
         return self.hole_share > MAX_HOLE_SHARE
 
 
 class ViewScorer:
-    """Renders a finished map at poses and compares with the frames taken there.
+    """Renders a finished map at given poses and compares the renders with the frames taken there.
 
     Args:
-        gaussians: the map, on the rasterizer's device; what is compared is brought there.
-        rasterizer: draws it.
-        depth: the range in which readings count. Its edge filter does not apply: a run that closes its eyes to
-            hard pixels is scored on them all the same.
-        lpips: a learned distance of images; None leaves it out.
+        gaussians: the map, on the rasterizer's device; frames are moved there.
+        rasterizer: renders the map.
+        depth: the range of valid depth readings. Its edge filter is ignored, so that a run which filters difficult
+            pixels is still scored on them.
+        lpips: a learned image distance; None skips it.
     """
 
     def __init__(
@@ -79,17 +82,17 @@ class ViewScorer:
         self._lpips = lpips
 
     def view(self, frame: RgbdFrame) -> View:
-        """The frame's images, with the depth readings that count."""
+        """Return the frame as tensors on the map's device, with the valid depth readings."""
         return View.from_frame(frame, self._depth).to(self._gaussians.means.device)
 
     def render(self, frame: RgbdFrame, T_world_cam: NDArray[np.float64]) -> Render:
-        """The map from a pose, in the frame's camera."""
+        """Render the map at a pose, with the frame's camera."""
         T_cam_world = pose_tensor(se3.inverse(T_world_cam), self._gaussians.means.device)
         with torch.no_grad():
             return self._rasterizer.render(self._gaussians, frame.camera, T_cam_world)
 
     def score(self, frame: RgbdFrame, T_world_cam: NDArray[np.float64]) -> FrameScores:
-        """How the map at a pose matches the frame taken there."""
+        """Score the render at a pose against the frame taken there."""
         render, view = self.render(frame, T_world_cam), self.view(frame)
         scores = score_view(render.rgb, render.depth(), view.rgb, view.depth, view.valid, self._lpips)
         original = original_scores(render, view.rgb, torch.from_numpy(frame.depth_m).to(view.depth.device), self._lpips)
@@ -101,15 +104,18 @@ def score_view(
     rendered: Tensor, rendered_depth_m: Tensor, rgb: Tensor, depth_m: Tensor, mask: Tensor,
     lpips: ImageDistance | None = None,
 ) -> ImageScores:  # fmt: skip
-    """Compare a render with what the camera saw.
+    """Compare a render with the frame.
 
     Args:
-        rendered: [3, H, W] colour; clamped to [0, 1] here.
+        rendered: [3, H, W] rendered colour; this function clamps it to [0, 1].
         rendered_depth_m: [H, W] expected depth, 0 where nothing was rendered.
-        rgb: [3, H, W] in [0, 1].
-        depth_m: [H, W].
-        mask: [H, W] bool, where there is a depth reading.
-        lpips: a learned distance of images; None leaves it out.
+        rgb: [3, H, W] the frame's colour in [0, 1].
+        depth_m: [H, W] the frame's depth.
+        mask: [H, W] bool, True where the frame has a depth reading.
+        lpips: a learned image distance; None skips it.
+
+    Returns:
+        The scores. Those over the depth readings are None if there is no reading.
     """
     rendered = rendered.clamp(0, 1)
     squared = (rendered - rgb) ** 2
@@ -131,13 +137,13 @@ def score_view(
 
 
 def original_scores(render: Render, rgb: Tensor, reading_m: Tensor, lpips: ImageDistance | None = None) -> OriginalScores:
-    """Compare as SplaTAM's ``eval_helpers.py`` does (read at commit da6bbcd; restated, not copied).
+    """Compare as SplaTAM's ``eval_helpers.py`` does (read at commit da6bbcd; reimplemented, not copied).
 
     Args:
-        render: the map at the pose.
-        rgb: [3, H, W] in [0, 1].
-        reading_m: [H, W] the sensor's depth, in its whole range; 0 = no reading.
-        lpips: a learned distance of images; None leaves it out.
+        render: the map rendered at the frame's pose.
+        rgb: [3, H, W] the frame's colour in [0, 1].
+        reading_m: [H, W] the frame's depth, not limited to the valid range; 0 = no reading.
+        lpips: a learned image distance; None skips it.
     """
     mask = reading_m > 0
     rendered, rgb = render.rgb * mask, rgb * mask
@@ -151,12 +157,12 @@ def original_scores(render: Render, rgb: Tensor, reading_m: Tensor, lpips: Image
 
 
 def mean_scores(frames: Iterable[FrameScores]) -> ImageScores:
-    """Each score's mean over the frames that have it; None where none does."""
+    """Return the mean of each score over the frames that have it; None if no frame has it."""
     return _means(ImageScores, [frame.scores for frame in frames])
 
 
 def mean_original_scores(frames: Iterable[FrameScores]) -> OriginalScores:
-    """The same, as the original counts."""
+    """Return the same means of the original's scores."""
     return _means(OriginalScores, [frame.original for frame in frames])
 
 

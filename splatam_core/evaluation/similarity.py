@@ -1,4 +1,4 @@
-"""How alike two images look: MS-SSIM, and LPIPS where its library and its weights are at hand."""
+"""Perceptual similarity of whole images: MS-SSIM, and LPIPS if its package and weights are installed."""
 
 from __future__ import annotations
 
@@ -14,30 +14,33 @@ from torch.nn import functional
 from splatam_core.images.ssim import ssim_terms
 
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
-"""Of the five scales, finest first (Wang et al. 2003, section 3.2)."""
+"""Exponents of the five scales, finest first (Wang et al. 2003, section 3.2)."""
 
 WINDOW_MARGIN = 5
+"""Half of the 11 pixel window, in pixels."""
+
 MIN_SIDE = 161
-"""Pixels; else the 11 pixel window does not fit into the coarsest scale."""
+"""Pixels. In smaller images the window does not fit into the coarsest scale."""
 
 LPIPS_NETWORK = 'alex'
 LPIPS_MIN_SIDE = 31
-"""Pixels; else nothing is left after AlexNet's second pooling."""
+"""Pixels. In smaller images nothing is left after AlexNet's second pooling."""
 
 
 def ms_ssim(a: Tensor, b: Tensor) -> float | None:
-    """Multi-scale structural similarity of whole images.
+    """Compute the multi-scale structural similarity of two whole images.
 
     Wang, Simoncelli, Bovik, "Multi-scale structural similarity for image quality assessment", 2003, equation 7:
-    contrast and structure at five scales, luminance at the coarsest, where the window lies inside the image. Halving
-    pads odd sizes with zeros, and a negative factor counts as zero, as in ``pytorch_msssim``, which the original uses.
+    contrast and structure at five scales, and luminance at the coarsest. Only windows that lie inside the image count.
+    As in ``pytorch_msssim``, which the original uses, odd sizes are padded with zeros before halving, and a negative
+    factor counts as zero.
 
     Args:
         a: [3, H, W] in [0, 1].
-        b: the same.
+        b: [3, H, W] in [0, 1].
 
     Returns:
-        The mean over the channels; None for images under 161 pixels on the short side.
+        The mean over the channels; None if the short side has fewer than 161 pixels.
     """
     if min(a.shape[-2:]) < MIN_SIDE:
         return None
@@ -63,16 +66,18 @@ def _inside(values: Tensor) -> Tensor:
 
 @dataclass(frozen=True, slots=True)
 class Lpips:
-    """Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018; AlexNet.
+    """LPIPS with AlexNet.
+
+    Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018.
 
     Attributes:
-        network: of the ``lpips`` package.
+        network: an ``lpips.LPIPS`` module.
     """
 
     network: Any
 
     def __call__(self, a: Tensor, b: Tensor) -> float | None:
-        """Distance of two [3, H, W] images in [0, 1]; None where they are too small."""
+        """Return the distance of two [3, H, W] images in [0, 1]; None if they are too small."""
         if min(a.shape[-2:]) < LPIPS_MIN_SIDE:
             return None
         with torch.no_grad():
@@ -81,7 +86,7 @@ class Lpips:
 
 @lru_cache(maxsize=1)
 def load_lpips() -> Lpips | str:
-    """LPIPS, or why there is none here."""
+    """Return LPIPS, or a message that says why it is not available."""
     try:
         import lpips
     except ImportError as error:

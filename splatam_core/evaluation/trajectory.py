@@ -1,9 +1,9 @@
-"""How far an estimated trajectory is from the truth: absolute (ATE) and relative (RPE) pose errors.
+"""Absolute (ATE) and relative (RPE) pose errors of an estimated trajectory against the ground truth.
 
-Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012, section IV. Two points are
-settled here: the truth is interpolated at the frame's stamp rather than taken from the nearest sample, and the
-alignment is rigid: a depth camera knows its scale. What SplaTAM's own evaluation prints in place of the ATE is
-``splatam_ate_mean_m``.
+Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012, section IV. The paper leaves two choices
+open. Here the ground truth is interpolated at the frame's stamp instead of taken from the nearest sample, and the
+alignment is rigid, without scale, because a depth camera measures scale. ``splatam_ate_mean_m`` is the number that
+SplaTAM's own evaluation prints as ATE.
 """
 
 from __future__ import annotations
@@ -25,65 +25,71 @@ from splatam_core.geometry.trajectory import (
 
 Indices = NDArray[np.intp]
 
-
 ONE_SECOND_NS = 1_000_000_000
 
 INTERVAL_TOLERANCE_NS = 20_000_000
-"""Two frames this close to a second apart count as a second apart; at 30 Hz the nearest is within 17 ms."""
+"""Tolerance of the interval between two frames one second apart. At 30 Hz the nearest frame is within 17 ms."""
 
 MIN_POSES = 3
-"""Two poses can always be laid onto each other: their error says nothing."""
+"""Fewer poses can always be aligned without error, so their ATE has no meaning."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrajectoryError:
-    """The absolute trajectory error of the frames that have a truth, N of them.
+    """The absolute trajectory error over the N frames that have ground truth.
 
     Attributes:
-        rmse_m: root of the mean squared distance of the camera centres after alignment.
-        stamps_ns: [N] int64.
+        rmse_m: root mean squared distance of the camera centres after alignment.
+        stamps_ns: [N] int64 stamps of the frames.
         estimate_m: [N, 3] estimated camera centres, in the estimate's world.
-        truth_m: [N, 3] true camera centres at the same stamps, brought into the estimate's world.
-        errors_m: [N] their distances.
-        T_estimate_truth: [4, 4] the rigid motion that brings the truth into the estimate's world.
+        ground_truth_m: [N, 3] true camera centres at the same stamps, aligned to the estimate's world.
+        errors_m: [N] distances between the two.
+        T_estimate_ground_truth: [4, 4] the rigid alignment from the ground truth's world to the estimate's.
     """
 
     rmse_m: float
     stamps_ns: NDArray[np.int64]
     estimate_m: NDArray[np.float64]
-    truth_m: NDArray[np.float64]
+    ground_truth_m: NDArray[np.float64]
     errors_m: NDArray[np.float64]
-    T_estimate_truth: NDArray[np.float64]
+    T_estimate_ground_truth: NDArray[np.float64]
 
 
-def trajectory_error(estimate: Trajectory, truth: Trajectory) -> TrajectoryError:
-    """Score a trajectory.
+def trajectory_error(estimate: Trajectory, ground_truth: Trajectory) -> TrajectoryError:
+    """Compute the absolute trajectory error.
 
     Args:
         estimate: online poses of the tracked frames, camera to world.
-        truth: true poses in any world frame, at any stamps of the same clock.
+        ground_truth: true poses in any world frame, at any stamps of the same clock.
 
     Raises:
-        RunFolderError: fewer than three poses have a truth at their stamp.
+        RunFolderError: fewer than three frames have ground truth at their stamp.
     """
-    centres, known = interpolate_centres(truth, estimate.stamps_ns)
+    centres, known = interpolate_centres(ground_truth, estimate.stamps_ns)
     if known.sum() < MIN_POSES:
-        raise RunFolderError(_too_few(estimate, truth, int(known.sum())))
+        raise RunFolderError(_too_few(estimate, ground_truth, int(known.sum())))
     estimate_m, true_m = estimate.T_world_cam[known, :3, 3], centres[known]
     T = align(true_m, estimate_m)
-    truth_m = true_m @ T[:3, :3].T + T[:3, 3]
-    errors_m = np.linalg.norm(estimate_m - truth_m, axis=1)
-    return TrajectoryError(_rms(errors_m), estimate.stamps_ns[known], estimate_m, truth_m, errors_m, T)
+    aligned_m = true_m @ T[:3, :3].T + T[:3, 3]
+    errors_m = np.linalg.norm(estimate_m - aligned_m, axis=1)
+    return TrajectoryError(
+        rmse_m=_rms(errors_m),
+        stamps_ns=estimate.stamps_ns[known],
+        estimate_m=estimate_m,
+        ground_truth_m=aligned_m,
+        errors_m=errors_m,
+        T_estimate_ground_truth=T,
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class RelativePoseError:
-    """How the motion between frames some time apart differs from the true motion.
+    """The relative pose error over pairs of frames a fixed time apart.
 
     Attributes:
-        translation_rmse_m: root of the mean squared translation of the difference; None where there is no pair.
-        rotation_rmse_deg: root of the mean squared angle of the difference.
-        pairs: how many pairs of frames entered.
+        translation_rmse_m: root mean squared translation error of the motion; None if there is no pair.
+        rotation_rmse_deg: root mean squared rotation error of the motion; None if there is no pair.
+        pairs: number of pairs of frames.
     """
 
     translation_rmse_m: float | None
@@ -92,20 +98,23 @@ class RelativePoseError:
 
 
 def relative_pose_errors(
-    estimate: Trajectory, truth: Trajectory, lost_ns: Collection[int] = ()
+    estimate: Trajectory, ground_truth: Trajectory, lost_ns: Collection[int] = ()
 ) -> tuple[RelativePoseError, RelativePoseError]:
-    """The relative pose error from each frame to the next, and over one second.
+    """Compute the relative pose error from each frame to the next, and over one second.
 
-    Sturm et al., equation 2: ``(Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`` of true poses Q and estimated poses P. No alignment
-    enters. Frame j is the next one, unless a frame between the two was lost; or the one nearest to a second later,
-    unless that is more than 20 ms off.
+    Sturm et al., equation 2: ``(Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`` with true poses Q and estimated poses P, without alignment.
+    For the first error, frame j is the next tracked frame; pairs with a lost frame between them are skipped. For the
+    second, frame j is the frame nearest to one second later; pairs more than 20 ms off are skipped.
 
     Args:
         estimate: online poses of the tracked frames.
-        truth: true poses, in any world frame.
+        ground_truth: true poses, in any world frame.
         lost_ns: stamps of the lost frames.
+
+    Returns:
+        The error from frame to frame, and the error over one second.
     """
-    true_poses, known = interpolate_poses(truth, estimate.stamps_ns)
+    true_poses, known = interpolate_poses(ground_truth, estimate.stamps_ns)
     stamps_ns, poses, true_poses = estimate.stamps_ns[known], estimate.T_world_cam[known], true_poses[known]
     gaps = np.array(sorted([*lost_ns, *map(int, estimate.stamps_ns[~known])]), dtype=np.int64)
     pairs = _next_frames(stamps_ns, gaps), _a_second_later(stamps_ns)
@@ -147,19 +156,19 @@ def _rms(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def splatam_ate_mean_m(estimate: Trajectory, truth: Trajectory) -> float:
-    """What SplaTAM's evaluation prints as "ATE RMSE": neither of camera centres, nor a root mean square.
+def splatam_ate_mean_m(estimate: Trajectory, ground_truth: Trajectory) -> float:
+    """Compute the number that SplaTAM's evaluation prints as "ATE RMSE".
 
-    It takes the translation columns of the world-to-camera matrices, -R^T c, aligns those of the truth rigidly to
-    those of the estimate, and averages the distances. They depend on where the world has its origin: the truth is put
-    into the world of the first pose that has one.
+    It is a mean, not a root mean square, and is not computed from camera centres. It takes the translation columns of
+    the world-to-camera matrices, -R^T c, aligns those of the ground truth rigidly to those of the estimate, and averages
+    the distances. The result depends on the origin of the world. Here the first pose with ground truth defines it.
 
     Raises:
-        RunFolderError: fewer than three poses have a truth at their stamp.
+        RunFolderError: fewer than three frames have ground truth at their stamp.
     """
-    true_poses, known = interpolate_poses(truth, estimate.stamps_ns)
+    true_poses, known = interpolate_poses(ground_truth, estimate.stamps_ns)
     if known.sum() < MIN_POSES:
-        raise RunFolderError(_too_few(estimate, truth, int(known.sum())))
+        raise RunFolderError(_too_few(estimate, ground_truth, int(known.sum())))
     poses, true_poses = estimate.T_world_cam[known], true_poses[known]
     true_poses = poses[0] @ se3.inverse(true_poses[0]) @ true_poses
     points, true_points = (se3.inverse(T)[:, :3, 3] for T in (poses, true_poses))
@@ -168,17 +177,17 @@ def splatam_ate_mean_m(estimate: Trajectory, truth: Trajectory) -> float:
 
 
 def align(source: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rigid motion that brings points onto others with the least squared distance.
+    """Find the rigid motion that aligns points to others with the least squared distance.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991,
-    equations 40 to 42, with the scale held at one.
+    equations 40 to 42, with the scale fixed to one.
 
     Args:
-        source: [N, 3].
-        target: [N, 3], where each should go.
+        source: [N, 3] points.
+        target: [N, 3] the corresponding points to align to.
 
     Returns:
-        T_target_source, [4, 4]. Where the points leave it open (all on one line, say), one of the best.
+        T_target_source, [4, 4]. If several are optimal (for points on a line, for example), one of them.
     """
     mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
     R = _nearest_rotation((target - mean_target).T @ (source - mean_source))
@@ -186,9 +195,9 @@ def align(source: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[n
 
 
 def align_poses(source: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rigid motion that brings poses onto others: the mean of their rotations, then of their centres.
+    """Find the rigid motion that aligns poses to others: the mean rotation first, then the mean translation.
 
-    Unlike ``align`` it is well defined for any path, a straight one or one that turns on the spot too.
+    Unlike ``align``, the result is unique for every path, including a straight one and a rotation on the spot.
 
     Args:
         source: [N, 4, 4] camera to the source's world, N at least 1.
@@ -202,7 +211,7 @@ def align_poses(source: NDArray[np.float64], target: NDArray[np.float64]) -> NDA
 
 
 def _nearest_rotation(M: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation R that makes trace(R^T M) largest."""
+    """Return the rotation R that maximises trace(R^T M)."""
     U, _, V_t = np.linalg.svd(M)
     return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(V_t))]) @ V_t
 
@@ -214,14 +223,15 @@ def _motion(R: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def transformed(trajectory: Trajectory, T_new_old: NDArray[np.float64]) -> Trajectory:
-    """The same trajectory seen from another world frame."""
+    """Return the same trajectory in another world frame."""
     return Trajectory(trajectory.stamps_ns, T_new_old @ trajectory.T_world_cam)
 
 
-def _too_few(estimate: Trajectory, truth: Trajectory, found: int) -> str:
+def _too_few(estimate: Trajectory, ground_truth: Trajectory, found: int) -> str:
     return (
-        f'{found} of {len(estimate)} tracked frames have a true pose at their stamp, at least {MIN_POSES} are needed: '
-        f'the frames span {_span(estimate)}, the truth {_span(truth)}; are they of the same recording and clock?'
+        f'{found} of {len(estimate)} tracked frames have ground truth at their stamp, at least {MIN_POSES} are needed: '
+        f'the frames span {_span(estimate)}, the ground truth {_span(ground_truth)}; '
+        'are they of the same recording and clock?'
     )
 
 

@@ -1,7 +1,8 @@
-"""A finished run scored from its folder: matching by stamp, nulls, the report's picture."""
+"""Scores of a finished run: frames matched by stamp, missing scores, and the report in its forms."""
 
 from __future__ import annotations
 
+import base64
 import csv
 import dataclasses
 import math
@@ -22,7 +23,9 @@ from splatam_core.evaluation.report.descriptions import DESCRIPTIONS
 from splatam_core.evaluation.report.frame_table import write_frame_table
 from splatam_core.evaluation.report.html import html_report
 from splatam_core.evaluation.report.picture import DPI, WIDTH_IN, write_report
-from splatam_core.evaluation.score import NovelViews, combine, score_images, score_novel_views, score_trajectory
+from splatam_core.evaluation.report.theme import DARK, LIGHT
+from splatam_core.evaluation.results import NovelViews, combine
+from splatam_core.evaluation.score import score_images, score_novel_views, score_trajectory
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.trajectory import Trajectory, stamp_from_text
@@ -243,20 +246,27 @@ def test_a_wrong_first_pose_spoils_the_first_pose_s_alignment_only(tmp_path: Pat
 
 
 class Page(HTMLParser):
-    """What a page is made of."""
+    """The tags, links, identifiers and text of a page or of an SVG image."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
         self.tags: list[str] = []
         self.links: list[str] = []
+        self.light_charts: list[str] = []
+        self.dark_charts: list[str] = []
         self.ids: list[str] = []
         self.text = ''
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append(tag)
+        if ('class', 'chart') in attrs:
+            self.light_charts.append(svg_text(dict(attrs)['src']))
+        if tag == 'source':
+            assert dict(attrs)['media'] == '(prefers-color-scheme: dark)'
+            self.dark_charts.append(svg_text(dict(attrs)['srcset']))
         for name, value in attrs:
-            if name in ('src', 'href', 'xlink:href'):
+            if name in ('src', 'srcset', 'href', 'xlink:href'):
                 self.links.append(value or '')
             if name == 'id':
                 self.ids.append(value or '')
@@ -265,16 +275,34 @@ class Page(HTMLParser):
         self.text += data
 
 
-def check_page(text: str) -> Page:
-    """It needs nothing beside it, and its charts take colours that the page defines."""
+def svg_text(address: str) -> str:
+    """Decode the address of an SVG image."""
+    kind, data = address.split(',', 1)
+    assert kind == 'data:image/svg+xml;base64'
+    return base64.b64decode(data, validate=True).decode()
+
+
+def check_self_contained(text: str) -> Page:
+    """A page or image needs no other file and no network, and every reference in it has one target."""
     page = Page(text)
     assert all(link.startswith(('data:image/', '#')) for link in page.links)
     assert not {'script', 'link', 'iframe'} & set(page.tags) and '@import' not in text
     assert {url for url in re.findall(r'url\(([^)]*)\)', text) if not url.startswith('#')} == set()
-    assert set(re.findall(r'var\((--[a-z]+)\)', text)) <= set(re.findall(r'(--[a-z]+):', text))
     referenced = set(re.findall(r'url\(#([^)]*)\)', text)) | {link[1:] for link in page.links if link.startswith('#')}
-    drawn = [name for name in page.ids if name in referenced]
-    assert referenced <= set(page.ids) and len(drawn) == len(set(drawn))  # no chart borrows another's clip path
+    targets = [name for name in page.ids if name in referenced]
+    assert referenced <= set(page.ids) and len(targets) == len(set(targets))
+    return page
+
+
+def check_page(text: str) -> Page:
+    """The page is self-contained, defines the colours it uses, and has every chart in light and dark."""
+    page = check_self_contained(text)
+    assert set(re.findall(r'var\((--[a-z-]+)\)', text)) <= set(re.findall(r'(--[a-z-]+):', text))
+    assert len(page.light_charts) == len(page.dark_charts) == 4
+    for charts, theme, other in ((page.light_charts, LIGHT, DARK), (page.dark_charts, DARK, LIGHT)):
+        for chart in charts:
+            check_self_contained(chart)
+            assert theme.ink in chart and other.ink not in chart and other.card not in chart
     return page
 
 
@@ -286,9 +314,9 @@ def test_page_is_complete_and_needs_nothing_else(tmp_path: Path, with_truth: boo
     images = score_images(run, sequence, 4, plain) if with_images else None
     novel = score_novel_views(run, sequence.ground_truth(), Aside(), 'first', plain) if with_truth and with_images else None
     page = check_page(html_report(combine(run, truth, images, novel)))
-    assert 'a run & <more>' in page.text and f'of {COUNT}' in page.text
+    assert 'a run & <more>' in page.text and f'of {COUNT}' in page.text and 'more' not in page.tags
     assert ('ATE RMSE' in page.text) and ('tracking.iterations' in page.text)
-    assert page.tags.count('img') == 7 * (len(images.samples) if images else 0) + 7 * (len(novel.samples) if novel else 0)
+    assert page.tags.count('figure') == 7 * (len(images.samples) if images else 0) + 7 * (len(novel.samples) if novel else 0)
     assert ('novel view, with holes' in page.text) == (novel is not None)
     assert ('No frames or no map' in page.text) == (not with_images)
 

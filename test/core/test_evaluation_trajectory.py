@@ -64,7 +64,7 @@ def test_a_mirror_image_is_not_aligned_away() -> None:
     truth = wandering(50)
     mirrored = Trajectory(truth.stamps_ns, truth.T_world_cam.copy())
     mirrored.T_world_cam[:, 0, 3] *= -1
-    T = trajectory_error(mirrored, truth).T_estimate_truth
+    T = trajectory_error(mirrored, truth).T_estimate_ground_truth
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
     assert trajectory_error(mirrored, truth).rmse_m > 0.01
 
@@ -77,7 +77,7 @@ def test_where_the_truth_has_its_world_changes_nothing(seed: int) -> None:
     T = se3.exp(rng.normal(0, 2, 6))
     here, there = trajectory_error(estimate, truth), trajectory_error(estimate, transformed(truth, T))
     assert there.rmse_m == pytest.approx(here.rmse_m, abs=ROUND_OFF_M)
-    np.testing.assert_allclose(there.truth_m, here.truth_m, atol=1e-10)  # cancels T and its inverse
+    np.testing.assert_allclose(there.ground_truth_m, here.ground_truth_m, atol=1e-10)  # cancels T and its inverse
 
 
 def test_independent_noise_shows_in_full() -> None:
@@ -141,7 +141,7 @@ def test_other_clock_is_an_error_that_names_both_spans() -> None:
     with pytest.raises(RunFolderError, match='2 of 2'):
         trajectory_error(Trajectory(truth.stamps_ns[:2], truth.T_world_cam[:2]), truth)
     nothing = Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
-    with pytest.raises(RunFolderError, match='the truth nothing'):
+    with pytest.raises(RunFolderError, match='the ground truth nothing'):
         trajectory_error(truth, nothing)
 
 

@@ -1,1 +1,1 @@
-"""Shows scores: pages, plots and tables."""
+"""Shows the scores of a run: a page, a picture, tables, and the comparison of several runs."""

@@ -1,4 +1,4 @@
-"""Several runs side by side: a table for Markdown and terminals, and a picture."""
+"""The comparison of several runs: a Markdown table, and a picture."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import matplotlib
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from splatam_core.evaluation.report import picture, plots
 from splatam_core.evaluation.report.descriptions import BY_NAME, Description
+from splatam_core.evaluation.report.theme import LIGHT
 from splatam_core.runs.metrics import Metrics
 from splatam_core.runs.record import RunRecord
 
@@ -22,7 +21,7 @@ COLUMNS = (
     'heldout_psnr_db', 'heldout_depth_l1_m', 'novel_psnr_db', 'novel_depth_l1_m', 'splatam_ate_mean_m',
     'splatam_psnr_db', 'splatam_ms_ssim', 'splatam_depth_l1_m', 'fps', 'num_gaussians', 'peak_rss_mb',
 )  # fmt: skip
-"""Of the table, where any run has them."""
+"""Numbers in the table. A column that is empty for all runs is left out."""
 
 PREFIXES = {'heldout_': 'held out: ', 'novel_': 'novel: ', 'splatam_': 'as original: '}
 BARS = ('ate_rmse_m', 'psnr_db', 'depth_l1_m', 'fps', 'num_gaussians', 'peak_rss_mb')
@@ -31,13 +30,15 @@ COLORS = ('#1769e0', '#d6409f', '#30a46c', '#f5a524', '#8e4ec6', '#00a2c7', '#e5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Run:
+    """A run with the label that distinguishes it from the others."""
+
     label: str
     record: RunRecord
     metrics: Metrics
 
 
 def comparison_table(runs: Sequence[RunRecord]) -> str:
-    """A Markdown table, one run a line, below what they have in common: source, commit, machine."""
+    """Return a Markdown table with one run per line, below a line with what the runs have in common."""
     named = _named(runs)
     commits = {run.commit or 'unknown' for run in runs}
     sources = {_source(run) for run in runs}
@@ -52,7 +53,7 @@ def comparison_table(runs: Sequence[RunRecord]) -> str:
         cells = [BY_NAME[name].text(run.metrics) for run in named]
         if any(cell != '\u2013' for cell in cells):
             columns.append((_heading(BY_NAME[name]), cells))
-    return '\n'.join([_in_common(runs, sources, commits), '', *_lines(columns)])
+    return '\n'.join([_in_common(runs, sources, commits), '', *_markdown(columns)])
 
 
 def _in_common(runs: Sequence[RunRecord], sources: set[str], commits: set[str]) -> str:
@@ -76,7 +77,7 @@ def _source(run: RunRecord) -> str:
 
 
 def _named(runs: Sequence[RunRecord]) -> list[_Run]:
-    """Runs with labels that tell them apart: the folder's name, or its path where two have the same."""
+    """Label each run with its folder's name, or with the folder's path if two runs have the same name."""
     names = [run.path.resolve().name for run in runs]
     labels = [name if names.count(name) == 1 else str(run.path) for name, run in zip(names, runs)]
     return [_Run(label, run, run.metrics()) for label, run in zip(labels, runs)]
@@ -88,7 +89,8 @@ def _heading(description: Description) -> str:
     return f'{label} {description.unit}'.rstrip()
 
 
-def _lines(columns: Sequence[tuple[str, list[str]]]) -> list[str]:
+def _markdown(columns: Sequence[tuple[str, list[str]]]) -> list[str]:
+    """Return the lines of a Markdown table, padded so that it is readable in a terminal."""
     widths = [max(len(heading), *map(len, cells)) for heading, cells in columns]
     rows = [[heading for heading, _ in columns], *zip(*(cells for _, cells in columns))]
     lines = ['| ' + ' | '.join(cell.ljust(width) for cell, width in zip(row, widths)) + ' |' for row in rows]
@@ -96,15 +98,15 @@ def _lines(columns: Sequence[tuple[str, list[str]]]) -> list[str]:
 
 
 def draw_comparison(runs: Sequence[RunRecord]) -> Figure:
-    """Bars of the headline numbers; below, paths from above, time per frame and map growth."""
+    """Draw bars of the most important numbers; below them the paths from above, time per frame and map size."""
     named = _named(runs)
     bars_in = 0.75 + 0.28 * len(named)
-    with matplotlib.rc_context(picture.STYLE):
-        figure = Figure(figsize=(15, bars_in + 4.6), facecolor='white', layout='constrained')
+    with matplotlib.rc_context(LIGHT.style()):
+        figure = Figure(figsize=(15, bars_in + 4.6), facecolor=LIGHT.card, layout='constrained')
         FigureCanvasAgg(figure)
-        above, below = figure.subfigures(2, 1, height_ratios=[bars_in, 4.6])
+        above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[bars_in, 4.6])[:, 0]
         shown = [name for name in BARS if any(run.metrics.values()[name] is not None for run in named)]
-        for index, (ax, name) in enumerate(zip(np.atleast_1d(above.subplots(1, len(shown))), shown)):
+        for index, (ax, name) in enumerate(zip(above.subplots(1, len(shown), squeeze=False)[0], shown)):
             _bars(ax, named, BY_NAME[name], with_labels=index == 0)
         path, times, size = below.subplots(1, 3)
         _paths(path, named)
@@ -121,14 +123,14 @@ def _bars(ax: Axes, runs: Sequence[_Run], description: Description, with_labels:
     values = [run.metrics.values()[description.name] for run in runs]
     shown = [0.0 if value is None else value * description.factor for value in values]
     bars = ax.barh(range(len(runs)), shown, color=[_color(index) for index in range(len(runs))], height=0.7)
-    ax.bar_label(bars, [description.text(run.metrics) for run in runs], padding=4, color=plots.INK, fontsize=9)
+    ax.bar_label(bars, [description.text(run.metrics) for run in runs], padding=4, color=LIGHT.ink, fontsize=9)
     ax.set_yticks(range(len(runs)), [run.label for run in runs] if with_labels else [''] * len(runs))
     ax.set(title=f'{description.label} {description.unit}'.rstrip(), xticks=[])
-    ax.set_xlim(0, 1.35 * max(*shown, 1e-9, 1e-9))
+    ax.set_xlim(0, 1.35 * max([*shown, 1e-9]))
     ax.invert_yaxis()
     ax.grid(False)
     ax.spines[['bottom', 'left']].set_visible(False)
-    ax.tick_params(left=False, labelcolor=plots.INK)
+    ax.tick_params(left=False, labelcolor=LIGHT.ink)
 
 
 def _paths(ax: Axes, runs: Sequence[_Run]) -> None:

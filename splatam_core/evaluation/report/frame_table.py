@@ -1,4 +1,4 @@
-"""``scores.csv``: what each frame scored, one line a view."""
+"""``scores.csv``: the scores of each frame, one line per view."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 from splatam_core.atomic_io import replaced
 from splatam_core.evaluation.images import FrameScores
-from splatam_core.evaluation.score import Evaluation
+from splatam_core.evaluation.results import Evaluation
 from splatam_core.geometry.trajectory import stamp_text
 from splatam_core.runs.metrics import ImageScores, OriginalScores
 
@@ -19,11 +19,12 @@ HEADER = ('stamp', 'kind', 'position_error_m', 'hole_share', 'has_holes', *SCORE
 
 
 def write_frame_table(evaluation: Evaluation, path: Path) -> None:
-    """Write the table of a run; one that is there is replaced once the new one is complete.
+    """Write the table of a run. An existing file is replaced only when the new one is complete.
 
-    Columns: the stamp in seconds; the kind of view, ``frame``, ``held out`` of the map, or ``novel``; the distance of
-    its camera centre to the truth after alignment; the share of its pixels that have a reading and see no map, and
-    whether that is too much for the novel-view protocol; then the scores of ``metrics.json``. What is not known is empty.
+    The columns are: the stamp in seconds; the kind of view (``frame``, ``held out`` of the map, or ``novel``); the
+    distance of its camera centre to the ground truth after alignment; the share of its pixels that have a reading but
+    see no map; 1 if that share exceeds the limit of the novel-view protocol, else 0; then the scores of
+    ``metrics.json``. Unknown values are empty.
     """
     with replaced(path) as temporary, temporary.open('w', newline='', encoding='utf-8') as file:
         writer = csv.writer(file, lineterminator='\n')
@@ -33,15 +34,15 @@ def write_frame_table(evaluation: Evaluation, path: Path) -> None:
 
 def _rows(evaluation: Evaluation) -> Iterator[list[str]]:
     errors_m: dict[int, float] = {}
-    if evaluation.truth is not None:
-        error = evaluation.truth.error
+    if evaluation.trajectory is not None:
+        error = evaluation.trajectory.error
         errors_m = dict(zip(error.stamps_ns.tolist(), error.errors_m.tolist()))
     frame, held_out, novel = KINDS
     if evaluation.images is not None:
-        apart = {view.stamp_ns for view in evaluation.images.held_out}
+        held_out_ns = {view.stamp_ns for view in evaluation.images.held_out}
         views = {view.stamp_ns: view for view in (*evaluation.images.frames, *evaluation.images.held_out)}
         for stamp_ns, view in sorted(views.items()):
-            yield _row(view, held_out if stamp_ns in apart else frame, errors_m.get(stamp_ns))
+            yield _row(view, held_out if stamp_ns in held_out_ns else frame, errors_m.get(stamp_ns))
     if evaluation.novel is not None:
         for view in sorted((*evaluation.novel.frames, *evaluation.novel.with_holes), key=lambda view: view.stamp_ns):
             yield _row(view, novel, None)

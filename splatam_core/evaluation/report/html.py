@@ -1,245 +1,262 @@
-"""``picture.html``: a run on one page that needs neither files beside it nor a network, for light and dark screens."""
+"""``report.html``: the results of a run on one page, without other files or a network, for light and dark screens."""
 
 from __future__ import annotations
 
 import base64
 import io
-import re
 from collections.abc import Callable, Iterator
-from html import escape
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from string import Template
 
 import cv2
+import jinja2
 import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import Normalize
+from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from splatam_core.atomic_io import replace_text
-from splatam_core.config import SlamConfig, flat_values, settings
-from splatam_core.evaluation.report import picture, plots
-from splatam_core.evaluation.report.descriptions import BY_NAME, DESCRIPTIONS, Description
-from splatam_core.evaluation.score import Evaluation, Sample
+from splatam_core.config import flat_values, settings
+from splatam_core.evaluation.report import plots
+from splatam_core.evaluation.report.descriptions import BY_NAME, DESCRIPTIONS
+from splatam_core.evaluation.report.picture import headline, number_text, subtitle
+from splatam_core.evaluation.report.theme import DARK, LIGHT, Theme
+from splatam_core.evaluation.results import Evaluation, Sample
 from splatam_core.runs import provenance
 from splatam_core.runs.metrics import Metrics
 
-TEMPLATE = Path(__file__).with_name('report_template.html')
-VARIABLES = {
-    plots.INK: '--ink', plots.MUTED: '--muted', plots.FAINT: '--faint', plots.TRUTH: '--truth', plots.LOST: '--lost',
-    plots.ESTIMATE: '--estimate', '#ffffff': '--card', '#30a46c': '--green', '#f5a524': '--orange', '#8e4ec6': '--violet',
-    '#d6409f': '--pink',
-}  # fmt: skip
-"""Colours of the charts, and the variables of the page that take their place: they differ between light and dark."""
-
-STYLE = {**picture.STYLE, 'svg.fonttype': 'none', 'axes.titlesize': 11, 'savefig.facecolor': 'none'}
+TEMPLATE = 'page.html'
 JPEG_QUALITY = 88
-Draw = Callable[[Figure, Evaluation], None]
+Draw = Callable[[Figure, Evaluation, Theme], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """A chart, drawn once for light and once for dark screens, as ``data:`` addresses of SVG images."""
+
+    name: str
+    light: str
+    dark: str
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """An image with its caption, as a ``data:`` address."""
+
+    caption: str
+    address: str
+
+
+@dataclass(frozen=True, slots=True)
+class SampleRow:
+    """The images of one sample frame and their heading."""
+
+    heading: str
+    pictures: tuple[Picture, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """A row of the table of all numbers. The value is an en dash if it is not known, and the note may say why."""
+
+    name: str
+    label: str
+    value: str
+    unit: str
+    meaning: str
+    note: str
+
+
+@dataclass(frozen=True, slots=True)
+class SettingRow:
+    """A row of the table of settings."""
+
+    name: str
+    value: str
+    help: str
+    is_changed: bool
 
 
 def write_html(evaluation: Evaluation, path: Path) -> None:
-    """Write the page of a run; one that is there is replaced once the new one is complete."""
+    """Write the page of a run. An existing page is replaced only when the new one is complete."""
     replace_text(path, html_report(evaluation))
 
 
 def html_report(evaluation: Evaluation) -> str:
-    """The page as a text."""
-    run = evaluation.run
-    name = run.path.resolve().name
-    return Template(TEMPLATE.read_text(encoding='utf-8')).substitute(
-        title=escape(name),
-        subtitle=escape(picture.subtitle(evaluation)),
-        tiles=''.join(_tiles(evaluation)),
-        notes=_notes(evaluation.metrics),
-        paths=_chart(evaluation, _paths, (11.5, 4.0), 'paths'),
-        over_time=_chart(evaluation, _over_time, (11.5, 3.4), 'over time'),
-        samples=''.join(_samples(evaluation)) or _nothing('No frames or no map to compare.'),
-        scores=_chart(evaluation, _scores, (11.5, 3.2), 'scores'),
-        stages=_chart(evaluation, _stages, (11.5, 3.4), 'stages'),
-        timings=_timings(evaluation.metrics),
-        metrics=''.join(_metrics(evaluation.metrics)),
-        config=''.join(_config(run.config)),
-        environment=''.join(_environment(evaluation)),
+    """Return the page as text."""
+    metrics = evaluation.metrics
+    return _environment().get_template(TEMPLATE).render(
+        title=evaluation.run.path.resolve().name,
+        subtitle=subtitle(evaluation),
+        light=asdict(LIGHT),
+        dark=asdict(DARK),
+        headline=headline(evaluation),
+        notes={BY_NAME[name].label if name in BY_NAME else name: why for name, why in metrics.notes.items()},
+        paths=_chart(evaluation, 'paths', _draw_paths, (11.5, 4.0)),
+        over_time=_chart(evaluation, 'path over time', _draw_over_time, (11.5, 3.4)),
+        samples=list(_samples(evaluation)),
+        scores=_chart(evaluation, 'scores of each frame', _draw_scores, (11.5, 3.2)),
+        stages=_chart(evaluation, 'time per frame and map size', _draw_stages, (11.5, 3.4)),
+        timings=metrics.timings_ms,
+        groups=dict(_number_groups(metrics)),
+        settings=list(_settings(evaluation)),
+        provenance=_provenance(evaluation),
+    )  # fmt: skip
+
+
+def _environment() -> jinja2.Environment:
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-
-
-def _tiles(evaluation: Evaluation) -> Iterator[str]:
-    for value, unit, name in picture.headline(evaluation):
-        yield f'<div class="tile"><b>{escape(value)}</b> <span>{escape(unit)}</span><p>{escape(name)}</p></div>'
-
-
-def _notes(metrics: Metrics) -> str:
-    notes = [(BY_NAME[name].label if name in BY_NAME else name, why) for name, why in metrics.notes.items()]
-    items = ''.join(f'<li><b>{escape(label)}</b> is not known: {escape(why)}</li>' for label, why in notes)
-    return f'<ul class="notes">{items}</ul>' if items else ''
-
-
-def _nothing(text: str) -> str:
-    return f'<p class="nothing">{escape(text)}</p>'
 
 
 # --- charts ---
 
 
-def _chart(evaluation: Evaluation, draw: Draw, size_in: tuple[float, float], name: str) -> str:
-    """A figure as SVG that takes its colours from the page."""
-    with matplotlib.rc_context({**STYLE, 'svg.hashsalt': name}):  # ids are made of the salt: none occurs twice on a page
+def _chart(evaluation: Evaluation, name: str, draw: Draw, size_in: tuple[float, float]) -> Chart:
+    return Chart(name, *(_svg(evaluation, draw, size_in, theme) for theme in (LIGHT, DARK)))
+
+
+def _svg(evaluation: Evaluation, draw: Draw, size_in: tuple[float, float], theme: Theme) -> str:
+    """Draw a chart in a theme. Returns the ``data:`` address of its SVG; the same input gives the same text."""
+    with matplotlib.rc_context({**theme.style(), 'svg.hashsalt': 'report'}):
         figure = Figure(figsize=size_in, facecolor='none', layout='constrained')
         FigureCanvasAgg(figure)
-        draw(figure, evaluation)
-        buffer = io.StringIO()
-        figure.savefig(buffer, format='svg', metadata={'Date': None, 'Creator': None, 'Format': None, 'Type': None})
-    return _for_page(buffer.getvalue(), name)
+        draw(figure, evaluation, theme)
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format='svg', facecolor='none', metadata={'Date': None, 'Creator': None})
+    return _data_address('image/svg+xml', buffer.getvalue())
 
 
-def _for_page(svg: str, name: str) -> str:
-    svg = svg[svg.index('<svg') :]
-    svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r'\1', svg, count=1)
-    svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', r'\1', svg, count=1)
-    svg = svg.replace('<svg', f'<svg role="img" aria-label="{escape(name)}"', 1)
-    for color, variable in VARIABLES.items():
-        svg = re.sub(re.escape(color), f'var({variable})', svg, flags=re.IGNORECASE)
-    return re.sub(r"'DejaVu Sans'(, [^;\"]*)?", 'inherit-page', svg).replace('inherit-page', 'system-ui, sans-serif')
-
-
-def _paths(figure: Figure, evaluation: Evaluation) -> None:
-    paths, right = figure.subfigures(1, 2, width_ratios=[2.2, 1])
+def _draw_paths(figure: Figure, evaluation: Evaluation, theme: Theme) -> None:
+    paths, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[2.2, 1])[0]
     above, side = paths.subplots(1, 2)
-    line = plots.path_view(above, evaluation, plots.ABOVE)
-    plots.path_view(side, evaluation, plots.SIDE)
+    line = plots.path_view(above, evaluation, theme, plots.ABOVE)
+    plots.path_view(side, evaluation, theme, plots.SIDE)
     if side.get_legend() is not None:
         side.get_legend().remove()
     if line is not None:
-        bar = paths.colorbar(line, ax=[above, side], fraction=0.03, pad=0.02, label='distance to the truth (cm)')
+        bar = paths.colorbar(line, ax=[above, side], fraction=0.03, pad=0.02, label='distance to the ground truth (cm)')
         bar.outline.set_visible(False)
-    plots.position_error(right.subplots(), evaluation)
+    plots.position_error(right.subplots(), evaluation, theme)
 
 
-def _over_time(figure: Figure, evaluation: Evaluation) -> None:
-    plots.coordinates_over_time(figure.subplots(3, 1, sharex=True), evaluation)
+def _draw_over_time(figure: Figure, evaluation: Evaluation, theme: Theme) -> None:
+    plots.coordinates_over_time(figure.subplots(3, 1, sharex=True), evaluation, theme)
 
 
-def _scores(figure: Figure, evaluation: Evaluation) -> None:
+def _draw_scores(figure: Figure, evaluation: Evaluation, theme: Theme) -> None:
     psnr, depth = figure.subplots(1, 2)
-    plots.image_scores(psnr, depth, evaluation)
+    plots.image_scores(psnr, depth, evaluation, theme)
     psnr.tick_params(labelbottom=True)
     psnr.set_xlabel('time (s)' if evaluation.images else '')
 
 
-def _stages(figure: Figure, evaluation: Evaluation) -> None:
+def _draw_stages(figure: Figure, evaluation: Evaluation, theme: Theme) -> None:
     times, size = figure.subplots(1, 2)
-    plots.stage_times(times, evaluation)
-    plots.map_size(size, evaluation)
+    plots.stage_times(times, evaluation, theme)
+    plots.map_size(size, evaluation, theme)
 
 
 # --- pictures ---
 
 
-def _samples(evaluation: Evaluation) -> Iterator[str]:
-    samples = evaluation.images.samples if evaluation.images else ()
-    for sample in samples:
+def _samples(evaluation: Evaluation) -> Iterator[SampleRow]:
+    for sample in evaluation.images.samples if evaluation.images else ():
         time_s = plots.seconds(evaluation, np.array([sample.frame.stamp_ns]))[0]
-        yield _sample(sample, f'{sample.title} frame, at {time_s:.2f} s')
+        yield _sample_row(sample, f'{sample.title} frame, at {time_s:.2f} s')
     for sample in evaluation.novel.samples if evaluation.novel else ():
         holes = ', with holes' if sample.scores.has_holes else ''
-        yield _sample(sample, f'{sample.title} novel view{holes}')
+        yield _sample_row(sample, f'{sample.title} novel view{holes}')
 
 
-def _sample(sample: Sample, title: str) -> str:
-    panels, scores = plots.Panels.of(sample), sample.scores.scores
-    low, high = panels.depth_norm.vmin, panels.depth_norm.vmax
-    pictures = [
-        ('colour', _jpeg(sample.frame.rgb)),
-        ('rendered', _jpeg(np.uint8(np.rint(sample.rgb * 255)))),
-        (f'difference, 0 to {plots.COLOR_DIFFERENCE_LIMIT:g}',
-         _colored(panels.rgb_difference, plots.DIFFERENCE_COLORS, Normalize(0, plots.COLOR_DIFFERENCE_LIMIT))),
-        ('silhouette, 0 to 1', _colored(sample.silhouette, matplotlib.colormaps['gray'], Normalize(0, 1))),
-        (f'depth, {low:.2f} to {high:.2f} m', _colored(panels.reading_m, plots.DEPTH_COLORS, panels.depth_norm)),
-        ('rendered depth', _colored(panels.rendered_m, plots.DEPTH_COLORS, panels.depth_norm)),
-        (f'difference, 0 to {panels.depth_difference_norm.vmax:g} cm',
-         _colored(panels.depth_difference_cm, plots.DIFFERENCE_COLORS, panels.depth_difference_norm)),
-    ]  # fmt: skip
-    known = [] if scores.psnr_db is None else [f'{scores.psnr_db:.1f} dB', f'depth L1 {scores.depth_l1_m * 100:.1f} cm']
-    figures = ''.join(
-        f'<figure><img src="{source}" alt="{escape(name)}"><figcaption>{escape(name)}</figcaption></figure>'
-        for name, source in pictures
-    )
-    heading = ' · '.join([title, *known])
-    return f'<h3>{escape(heading)}</h3><div class="pictures">{figures}</div>'
+def _sample_row(sample: Sample, title: str) -> SampleRow:
+    scores = sample.scores.scores
+    known = []
+    if scores.psnr_db is not None:
+        known = [f'{number_text(scores.psnr_db, 1, 1)} dB', f'depth L1 {number_text(scores.depth_l1_m, 100, 1)} cm']
+    return SampleRow(' · '.join([title, *known]), tuple(_pictures(sample)))
 
 
-def _jpeg(rgb: np.ndarray) -> str:
+def _pictures(sample: Sample) -> Iterator[Picture]:
+    panels, gray = plots.Panels.of(sample), matplotlib.colormaps['gray']
+    depth_norm, depth_difference_norm = panels.depth_norm, panels.depth_difference_norm
+    color_limit, colors = plots.COLOR_DIFFERENCE_LIMIT, plots.DIFFERENCE_COLORS
+    depth_caption = f'depth, {depth_norm.vmin:.2f} to {depth_norm.vmax:.2f} m'
+    difference_caption = f'difference, 0 to {depth_difference_norm.vmax:g} cm'
+    yield Picture('colour', _jpeg(sample.frame.rgb))
+    yield Picture('rendered', _jpeg(np.rint(sample.rgb * 255).astype(np.uint8)))
+    yield Picture(f'difference, 0 to {color_limit:g}', _png(panels.rgb_difference, colors, Normalize(0, color_limit)))
+    yield Picture('silhouette, 0 to 1', _png(sample.silhouette, gray, Normalize(0, 1)))
+    yield Picture(depth_caption, _png(panels.reading_m, plots.DEPTH_COLORS, depth_norm))
+    yield Picture('rendered depth', _png(panels.rendered_m, plots.DEPTH_COLORS, depth_norm))
+    yield Picture(difference_caption, _png(panels.depth_difference_cm, colors, depth_difference_norm))
+
+
+def _jpeg(rgb: NDArray[np.uint8]) -> str:
     _, data = cv2.imencode('.jpg', np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return _data_uri('image/jpeg', data.tobytes())
+    return _data_address('image/jpeg', data.tobytes())
 
 
-def _colored(values: np.ndarray, colors: matplotlib.colors.Colormap, norm: Normalize) -> str:
-    rgb = colors(norm(np.ma.masked_invalid(values)), bytes=True)[..., :3]
+def _png(values: NDArray[np.floating], colors: Colormap, norm: Normalize) -> str:
+    """Colour an image [H, W]; NaN gets the colour map's colour for missing values."""
+    rgb = np.asarray(colors(norm(np.ma.masked_invalid(values)), bytes=True))[..., :3]
     _, data = cv2.imencode('.png', np.ascontiguousarray(rgb[..., ::-1]))
-    return _data_uri('image/png', data.tobytes())
+    return _data_address('image/png', data.tobytes())
 
 
-def _data_uri(kind: str, data: bytes) -> str:
+def _data_address(kind: str, data: bytes) -> str:
     return f'data:{kind};base64,{base64.b64encode(data).decode("ascii")}'
 
 
 # --- tables ---
 
 
-def _timings(metrics: Metrics) -> str:
-    if not metrics.timings_ms:
-        return _nothing('No times recorded.')
-    rows = ''.join(
-        f'<tr><td>{escape(stage)}</td><td class="n">{times.median:.1f}</td><td class="n">{times.p95:.1f}</td></tr>'
-        for stage, times in metrics.timings_ms.items()
-    )
-    head = '<tr><th>stage</th><th class="n">median ms</th><th class="n">95 % below ms</th></tr>'
-    return f'<table class="narrow">{head}{rows}</table>'
-
-
-def _metrics(metrics: Metrics) -> Iterator[str]:
-    """The groups of which at least one number is known."""
+def _number_groups(metrics: Metrics) -> Iterator[tuple[str, list[Number]]]:
+    """Yield heading and rows of each group in which at least one number is known."""
+    values = metrics.values()
     for heading, descriptions in DESCRIPTIONS.items():
-        if any(metrics.values()[description.name] is not None for description in descriptions):
-            yield f'<tr class="group"><th colspan="4">{escape(heading)}</th></tr>'
-            yield from (_metric(description, metrics) for description in descriptions)
-
-
-def _metric(description: Description, metrics: Metrics) -> str:
-    is_known = metrics.values()[description.name] is not None
-    unit = f' <span>{escape(description.unit)}</span>' if description.unit and is_known else ''
-    note = metrics.notes.get(description.name)
-    meaning = escape(description.meaning) + (f' <i>Not known: {escape(note)}</i>' if note else '')
-    return (
-        f'<tr><td>{escape(description.label)}</td><td class="n">{escape(description.text(metrics))}{unit}</td>'
-        f'<td>{meaning}</td><td><code>{escape(description.name)}</code></td></tr>'
-    )
-
-
-def _config(config: SlamConfig) -> Iterator[str]:
-    values = flat_values(config)
-    for setting in settings():
-        value = values[setting.name]
-        changed = ' class="changed"' if value != setting.default else ''
-        unit = f' {setting.unit}' if setting.unit else ''
+        if all(values[description.name] is None for description in descriptions):
+            continue
         yield (
-            f'<tr{changed}><td><code>{escape(setting.name)}</code></td><td class="n">{escape(f"{value}{unit}")}</td>'
-            f'<td>{escape(setting.help)}</td></tr>'
+            heading,
+            [
+                Number(
+                    name=description.name,
+                    label=description.label,
+                    value=description.text(metrics),
+                    unit=description.unit if values[description.name] is not None else '',
+                    meaning=description.meaning,
+                    note=metrics.notes.get(description.name, ''),
+                )
+                for description in descriptions
+            ],
         )
 
 
-def _environment(evaluation: Evaluation) -> Iterator[str]:
+def _settings(evaluation: Evaluation) -> Iterator[SettingRow]:
+    values = flat_values(evaluation.run.config)
+    for setting in settings():
+        value = values[setting.name]
+        yield SettingRow(setting.name, f'{value} {setting.unit or ""}'.rstrip(), setting.help, value != setting.default)
+
+
+def _provenance(evaluation: Evaluation) -> dict[str, str]:
+    """Return what the run was made from and with, by name."""
     run = evaluation.run
     camera = run.camera
-    rows = {
+    return {
         'program': run.description.program,
         'source': run.description.source.path if run.description.source else 'live topics',
         'camera': f'{camera.width}x{camera.height}, f {camera.fx:.1f} {camera.fy:.1f}' if camera else 'not known',
         'commit': run.commit or 'not known',
-        **{f'machine: {name}': value for name, value in run.machine.items()},
-        **{f'version: {name}': value or 'not installed' for name, value in run.versions.items()},
+        **{f'machine: {name}': str(value) for name, value in run.machine.items()},
+        **{f'version: {name}': str(value or 'not installed') for name, value in run.versions.items()},
         'report drawn by commit': provenance.commit() or 'not known',
     }
-    for name, value in rows.items():
-        yield f'<tr><td>{escape(name)}</td><td>{escape(str(value))}</td></tr>'
