@@ -42,7 +42,7 @@ class MapLifecycle:
             config: SLAM configuration.
             logger: logger of the node.
             frames: locate the camera in the coordinate frames of ROS.
-            outputs: are told when a new map begins and when the motion is interrupted.
+            outputs: receive a call when a new map begins and when the motion is interrupted.
 
         Raises:
             RunFolderError: there is no place to save to.

@@ -1,0 +1,128 @@
+"""Resets, time jumps and loading: MapLifecycle tells the others, and knows the transform from world to map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splatam_core.config import load_config
+from splatam_core.errors import ConfigError
+from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status
+from splatam_ros.frames.rep105 import Located
+from splatam_ros.node.map_lifecycle import MapLifecycle
+from splatam_ros.node.parameters import node_options
+
+CAMERA = PinholeCamera(4, 3, 4.0, 4.0, 1.5, 1.0)
+T_MAP_WORLD = se3.exp(np.array([1.0, 2, 3, 0, 0, 0.5]))
+
+
+class Calls:
+    """Records the calls that it gets under any name; stands in for Slam, outputs and a logger."""
+
+    def __init__(self, **attributes: Any) -> None:
+        self.calls: list[str] = []
+        self.__dict__.update(attributes)
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *args, **kwargs: self.calls.append(name)
+
+
+class Frames(Calls):
+    """Locates every camera, at the given or else at a new map."""
+
+    def locate(self, frame: RgbdFrame, T_world_cam: np.ndarray, T_map_world: np.ndarray | None) -> Located:
+        self.calls.append('new map' if T_map_world is None else 'same map')
+        T = T_MAP_WORLD if T_map_world is None else T_map_world
+        return Located(frame.stamp_ns, frame.frame_id, frame.frame_id, T, T @ T_world_cam, T @ T_world_cam, None)
+
+
+class Bench:
+    """A lifecycle without a node."""
+
+    def __init__(self, **options: Any) -> None:
+        self.slam = Calls(camera=CAMERA, num_gaussians=1, config=load_config('quick'))
+        self.frames, self.outputs, self.logger = Frames(), Calls(), Calls()
+        self.lifecycle = MapLifecycle(node_options(options), load_config('quick'), self.logger, self.frames, self.outputs)
+        self._stamp_ns = 0
+
+    def feed(self, status: Status = Status.TRACKED, epoch: int = 0, camera: PinholeCamera = CAMERA) -> Located | None:
+        self._stamp_ns += 10**9
+        T = None if status is Status.LOST else np.eye(4)
+        frame = RgbdFrame(self._stamp_ns, np.zeros((3, 4, 3), np.uint8), np.ones((3, 4), np.float32), camera, epoch)
+        result = FrameResult(0, self._stamp_ns, status, T, False, 1, 1.0, 1.0, '', StageTimings())
+        self.lifecycle.before_frame(self.slam, frame)
+        self.lifecycle.record(frame, result)
+        located = self.lifecycle.locate(frame, result)
+        self.lifecycle.after_frame(self.slam, result)
+        return located
+
+
+def maps(bench: Bench) -> list[str]:
+    """Which map each located frame is in."""
+    return [call for call in bench.frames.calls if call.endswith('map')]
+
+
+def test_the_first_located_frame_defines_the_map() -> None:
+    bench = Bench()
+    assert bench.feed(Status.LOST) is None
+    for _ in range(2):
+        located = bench.feed()
+        assert located is not None and np.array_equal(located.T_map_world, T_MAP_WORLD)
+    assert maps(bench) == ['new map', 'same map']
+    assert bench.outputs.calls == bench.slam.calls == []
+
+
+def test_a_reset_begins_another_map() -> None:
+    bench = Bench()
+    bench.feed()
+    assert 'new map' in bench.lifecycle.reset(bench.slam, 'because')
+    bench.feed()
+    assert maps(bench) == ['new map', 'new map']
+    assert (bench.slam.calls, bench.outputs.calls, bench.logger.calls) == (['reset'], ['begin_map'], ['warning'])
+
+
+@pytest.mark.parametrize(
+    ('policy', 'slam', 'outputs', 'second'),
+    [('reset', 'reset', 'begin_map', 'new map'), ('continue', 'rest', 'interrupt_motion', 'same map')],
+)
+def test_a_time_jump_is_handled_once_and_as_configured(policy: str, slam: str, outputs: str, second: str) -> None:
+    bench = Bench(on_time_jump=policy)
+    for epoch in (0, 1, 1):
+        bench.feed(epoch=epoch)
+    assert maps(bench) == ['new map', second, 'same map']
+    assert (bench.slam.calls, bench.outputs.calls) == ([slam], [outputs])
+
+
+@pytest.mark.parametrize(('policy', 'calls'), [('reset', ['reset']), ('refuse', [])])
+def test_another_camera(policy: str, calls: list[str]) -> None:
+    bench = Bench(on_camera_change=policy)
+    bench.feed()
+    bench.feed(camera=replace(CAMERA, fx=5.0))
+    assert bench.slam.calls == calls
+
+
+def test_a_camera_that_is_lost_for_long_starts_another_map() -> None:
+    bench = Bench(lost_reset_after=2.0)
+    bench.feed()
+    for _ in range(2):
+        bench.feed(Status.LOST)
+    bench.feed()  # found again: the time starts over
+    for _ in range(2):
+        bench.feed(Status.LOST)
+    assert bench.slam.calls == []
+    bench.feed(Status.LOST)
+    assert (bench.slam.calls, bench.outputs.calls) == (['reset'], ['begin_map'])
+
+
+def test_a_map_that_cannot_be_loaded_changes_nothing(tmp_path: Path) -> None:
+    for options in ({}, {'load_path': str(tmp_path), 'load_pose': '1 2 3'}):
+        bench = Bench(**options)
+        with pytest.raises(ConfigError):
+            bench.lifecycle.load(bench.slam)
+        assert bench.slam.calls == bench.outputs.calls == []
