@@ -43,7 +43,7 @@ def refine(args: argparse.Namespace) -> int:
     before = mean_scores(score_images(run, sequence, args.every, progress('scoring')).frames)
     refined = refine_map(
         gaussians, sequence, run.mapped_poses(), rasterizer, run.config,
-        args.iterations, progress('refining', 'step'), args.densify,
+        iterations=args.iterations, progress=progress('refining', 'step'), densify=args.densify,
     )  # fmt: skip
     write_refined(run, args.out, refined, args.iterations, args.densify)
     metrics = score_own_run(open_run(args.out, args.device), sequence, args.every)
