@@ -1,4 +1,4 @@
-"""Why no frames come: told from the real graph."""
+"""Reasons why no frames are received, found on the real graph."""
 
 from __future__ import annotations
 
