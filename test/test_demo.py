@@ -1,4 +1,4 @@
-"""The demo as a process: the whole way, what it refuses to remove, and that nothing of it lives on."""
+"""The demo as a process: a complete run, folders that it refuses to remove, and no process left behind."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TIMEOUT_S = 240  # a few seconds alone, but continuous integration may share its
 
 
 def start_demo(out: Path, source: str) -> subprocess.Popen[str]:
-    """Start it, every process of it tagged with the folder."""
+    """Start the demo; each of its processes is tagged with the folder."""
     return subprocess.Popen(
         [*DEMO, source, '--out', str(out)], env={**os.environ, TAG: str(out)},
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
@@ -30,7 +30,7 @@ def start_demo(out: Path, source: str) -> subprocess.Popen[str]:
 
 
 def alive(out: Path) -> list[str]:
-    """Command lines of the processes that carry the folder's tag."""
+    """Returns the command lines of the processes with the folder's tag."""
     found = []
     for process in Path('/proc').glob('[0-9]*'):
         try:

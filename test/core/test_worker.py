@@ -1,4 +1,4 @@
-"""SlamWorker: order, full queues, bad frames, crashes and shutdown, with a Slam we can hold still."""
+"""SlamWorker: order, full queues, bad frames, crashes and shutdown, with a Slam that the test can pause."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def frame(stamp_ns: int) -> RgbdFrame:
 
 
 class HeldSlam:
-    """Processes one frame for each ``release``; refuses stamp 13, breaks at stamp 99."""
+    """Processes one frame per ``release``; raises FrameError at stamp 13 and another exception at stamp 99."""
 
     def __init__(self, held: bool = True) -> None:
         self.gate = threading.Semaphore(0 if held else 10_000)
@@ -46,7 +46,7 @@ class HeldSlam:
 
 
 class Recorder:
-    """What a worker reported."""
+    """Records what a worker reports."""
 
     def __init__(self) -> None:
         self.results: list[int] = []
@@ -153,7 +153,7 @@ def test_a_crash_stops_intake_and_surfaces_in_stop() -> None:
     worker.submit(frame(99))
     slam.wait_started()
     worker.submit(frame(100))
-    thread, raised = submit_in_thread(worker, 101)  # waits for room that will never be
+    thread, raised = submit_in_thread(worker, 101)  # waits for a full queue that never empties
     slam.release(1)
     thread.join(TIMEOUT_S)
     assert isinstance(raised[0].__cause__, ZeroDivisionError)

@@ -1,4 +1,4 @@
-"""A camera of the tests' own, and the node with settings that are fast rather than good."""
+"""A camera for tests, and the node with fast settings."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from msg_adapters.factory import RclpyMessages
 from splatam_core.datasets.synthetic import SyntheticSequence
 from splatam_core.types import RgbdFrame
 
-# These tests are about messages, not about maps: few steps, and nothing is lost that could be followed at all.
+# These tests are about messages, not maps: few steps, and a low limit below which tracking counts as lost.
 QUICK = {
     'tracking.iterations': 6, 'mapping.iterations': 3, 'mapping.every': 1, 'tracking.min_inlier_fraction': 0.1,
     'threads': 1,
@@ -33,7 +33,7 @@ STREAMS = ('info', 'rgb', 'depth')
 
 
 def run_node(graph: Graph, *ros_arguments: str, **parameters: Any) -> Process:
-    # On a busy machine the first frame takes its time; only tests of that warning want it.
+    # On a busy machine the first frame takes long; tests of the warning set their own timeout.
     return graph.run_node(*ros_arguments, **{'preset': 'quick', 'no_data_timeout': 60.0, **SLAM, **parameters})
 
 
@@ -42,7 +42,7 @@ def stamps_of(messages: list[Any]) -> list[int]:
 
 
 class Camera:
-    """A camera of the test's, sending what it is told to."""
+    """A camera that sends what the test tells it to."""
 
     TOPICS: Mapping[str, tuple[type, str]] = {
         'info': (CameraInfo, '/rgb/camera_info'), 'rgb': (Image, '/rgb/image'), 'depth': (Image, '/depth/image'),
@@ -84,7 +84,7 @@ class Camera:
 
 
 class CompressedCamera(Camera):
-    """The same as image_transport's plugins send it. ``color`` is jpeg or png, ``depth`` 16UC1 or 32FC1."""
+    """A camera that sends images as image_transport's plugins do. ``color`` is jpeg or png, ``depth`` 16UC1 or 32FC1."""
 
     TOPICS = {
         'info': (CameraInfo, '/rgb/camera_info'), 'rgb': (CompressedImage, '/rgb/image/compressed'),
@@ -110,7 +110,7 @@ def info_message(frame: RgbdFrame) -> CameraInfo:
 
 
 class Live:
-    """A node at work, fed frame by frame by a camera; each frame is waited for until it is done with."""
+    """A running node and a camera that feeds it frame by frame; waits for each frame to be processed."""
 
     def __init__(self, graph: Graph, *ros_arguments: str, camera_class: type[Camera] = Camera, **parameters: Any) -> None:
         self.graph = graph
@@ -122,7 +122,7 @@ class Live:
         self.wait(lambda: all(map(graph.node.count_publishers, ('/splatam/processed', '/splatam/pose'))))
 
     def wait(self, condition: Callable[[], object]) -> None:
-        """Spin until it is so; a node that has ended is not waited for."""
+        """Spin until the condition holds; fails if the node ends."""
         self.graph.spin_until(lambda: condition() or not self.node.is_running, explain=lambda: self.node.text)
         assert self.node.is_running, self.node.text
 
@@ -130,7 +130,7 @@ class Live:
         self.wait(lambda: self.node.says(*parts))
 
     def show(self, frame: RgbdFrame, **options: Any) -> PoseStamped | None:
-        """Send a frame; its pose, None if it has none."""
+        """Send a frame, and return its pose; None if it has none."""
         self.camera.send(frame, **options)
         self.wait_done(frame.stamp_ns)
         return self.pose_of(frame.stamp_ns)
@@ -139,7 +139,7 @@ class Live:
         self.wait(lambda: self.done and stamps.to_ns(self.done[-1].stamp) == stamp_ns)
 
     def pose_of(self, stamp_ns: int) -> PoseStamped | None:
-        """Its pose is published before ``~/processed``, on another topic: it is among the next messages, if there is one."""
+        """Returns the pose of a processed frame. It was published before ``~/processed``, so it is among the next messages."""
         for _ in range(4):
             for pose in reversed(self.poses):
                 if stamps.message_stamp_ns(pose) == stamp_ns:
@@ -154,5 +154,5 @@ def position(pose: PoseStamped) -> NDArray[np.float64]:
 
 
 def still(frames: SyntheticSequence, number: int) -> RgbdFrame:
-    """A frame of a camera that does not move: nothing that could be lost."""
+    """Returns a frame of a camera that does not move, so that tracking cannot fail."""
     return replace(frames[0], stamp_ns=10**9 + number * 10**8)

@@ -1,4 +1,4 @@
-"""A running node as somebody on its graph controls it: services and parameters."""
+"""Controls a running node over the graph: services and parameters."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Control:
         return response.message
 
     def set(self, **values: Any) -> list[SetParametersResult]:
-        """One result a parameter; ``a__b`` stands for ``a.b``."""
+        """Set parameters; returns one result per parameter. ``a__b`` stands for ``a.b``."""
         self._graph.spin_until(self._parameters.services_are_ready)
         changes = [Parameter(name.replace('__', '.'), value=value) for name, value in values.items()]
         future = self._parameters.set_parameters(changes)

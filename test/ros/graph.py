@@ -1,4 +1,4 @@
-"""A ROS graph for one test: processes under test on it, and a node of the test's own."""
+"""A ROS graph for one test, with the processes under test and a node of the test."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def environment(domain: int, log_folder: Path) -> dict[str, str]:
 
 
 class Process:
-    """A process under test; what it says goes into a file."""
+    """A process under test; its output goes into a file."""
 
     def __init__(self, command: Sequence[str], environment: dict[str, str], log: Path, stdin: int = subprocess.DEVNULL) -> None:
         self._log = log
@@ -65,14 +65,14 @@ class Process:
         self._process.send_signal(number)
 
     def wait(self, timeout_s: float = TIMEOUT_S) -> int:
-        """Its exit code."""
+        """Wait for its end; returns the exit code."""
         try:
             return self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             raise AssertionError(f'still running after {timeout_s} s, and said:\n{self.text}') from None
 
     def says(self, *parts: str) -> bool:
-        """Whether one line holds all of these."""
+        """Returns True if one line of the output contains all parts."""
         return any(all(part in line for part in parts) for line in self.lines)
 
     def wait_says(self, *parts: str, timeout_s: float = TIMEOUT_S) -> None:
@@ -98,7 +98,7 @@ def wait_until(condition: Callable[[], object], timeout_s: float = TIMEOUT_S, ex
 
 
 class Graph:
-    """A domain of its own."""
+    """A ROS graph on its own domain."""
 
     def __init__(self, folder: Path) -> None:
         self.domain, self._reservation = reserve_domain()
@@ -123,7 +123,7 @@ class Graph:
     def run_node(self, *ros_arguments: str, **parameters: Any) -> Process:
         return self.start('-m', 'splatam_ros.node.main', *node_arguments(*ros_arguments, **parameters))
 
-    # --- the test's own node ---
+    # --- the node of the test ---
 
     @property
     def node(self) -> Node:
@@ -145,10 +145,23 @@ class Graph:
             self._executor.spin_once(timeout_sec=0.05)
 
     def spin_for(self, seconds: float) -> None:
-        """For what must not happen: there is no event to wait for."""
+        """Spin for a time in which something must not happen."""
         deadline_s = time.monotonic() + seconds
         while time.monotonic() < deadline_s:
             self._executor.spin_once(timeout_sec=0.05)
+
+    def settled(self, count: Callable[[], int], quiet_s: float = 0.5) -> int:
+        """Spin until a count has not changed for some time, so that what was on its way has arrived. Returns the count."""
+        last, since_s = count(), time.monotonic()
+
+        def is_quiet() -> bool:
+            nonlocal last, since_s
+            if count() != last:
+                last, since_s = count(), time.monotonic()
+            return time.monotonic() - since_s > quiet_s
+
+        self.spin_until(is_quiet, explain=lambda: f'the count is {count()} and grows')
+        return last
 
     def collect(self, message_class: type, topic: str, qos: QoSProfile = RELIABLE, raw: bool = False) -> list[Any]:
         """Subscribe; the list grows while the graph spins."""
@@ -170,7 +183,7 @@ class Graph:
 
 
 def node_arguments(*ros_arguments: str, **parameters: Any) -> list[str]:
-    """Arguments that set parameters; ``a__b`` stands for ``a.b``."""
+    """Returns arguments that set parameters; ``a__b`` stands for ``a.b``."""
     settings = {name.replace('__', '.'): value for name, value in parameters.items()}
     words = [word for name, value in settings.items() for word in ('-p', f'{name}:={_yaml(value)}')]
     return ['--ros-args', *words, *ros_arguments]

@@ -21,13 +21,13 @@ from splatam_core.types import RgbdFrame
 from splatam_ros.node.gate import FrameGate
 
 SECOND = 10**9
-# Where a camera that does not move may be found, at 64 pixels width and a handful of steps: a pixel is 4 cm at 2.5 m.
+# Largest error of a camera that does not move, at 64 pixels width and with few steps: a pixel is 4 cm at 2.5 m.
 STILL_M = 0.04
-MOVED_M = 0.08  # what tells two places apart in these tests; they are further apart than this
+MOVED_M = 0.08  # two places in these tests are further apart than this
 
 
 def moving(frames: SyntheticSequence, number: int, view: int) -> RgbdFrame:
-    """What the camera sees at ``frames[view]``, as the frame of some time."""
+    """Returns the view of ``frames[view]`` with the stamp of a frame number."""
     return replace(frames[view], stamp_ns=SECOND + number * 10**8)
 
 
@@ -41,7 +41,7 @@ def test_pause_resume_reset_and_save(graph: Graph, frames: SyntheticSequence) ->
     assert len(saved.means) > 500 and len(read_run(out).trajectory) == 3
 
     assert 'dropped' in control.succeed('pause') and 'already' in control.succeed('pause')
-    assert [live.show(still(frames, number)) for number in (3, 4)] == [None, None]  # answered, but not looked at
+    assert [live.show(still(frames, number)) for number in (3, 4)] == [None, None]  # answered, but not processed
     control.succeed('save_map')
     assert len(read_run(out).frames) == 3 and len(read_ply(out / 'map.ply').means) == len(saved.means)
     assert control.succeed('resume') == 'resumed' and 'not paused' in control.succeed('resume')
@@ -65,19 +65,19 @@ def test_saving_elsewhere_at_run_time(graph: Graph, frames: SyntheticSequence) -
     assert not refused.successful and 'expected a folder below save_root' in refused.reason
     assert 'save_path is empty' in control.fail('save_map')
 
-    for name, frame_count in (('first', 1), ('second', 2)):  # the second has the trajectory of the first
+    for name, frame_count in (('first', 1), ('second', 2)):  # the second contains the trajectory of the first
         control.change(save_path=str(graph.folder / name))
         control.succeed('save_map')
         assert live.show(still(frames, frame_count))
         control.succeed('save_map')
         assert len(read_run(graph.folder / name).trajectory) == frame_count
         assert read_ply(graph.folder / name / 'map.ply').means.any()
-    assert not list(graph.folder.glob('.*'))  # nothing half-made is left
+    assert not list(graph.folder.glob('.*'))  # no temporary files are left
 
 
 @pytest.fixture(scope='module')
 def saved_map(frames: SyntheticSequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A map of the recording by the paper's settings, in a file."""
+    """Returns the file of a map of the recording."""
     slam = Slam(load_config('quick', {'threads': 1, 'mapping.every': 1}))
     assert all(slam.process(frame).T_world_cam is not None for frame in frames)
     path = tmp_path_factory.mktemp('map') / 'map.ply'
@@ -86,7 +86,7 @@ def saved_map(frames: SyntheticSequence, tmp_path_factory: pytest.TempPathFactor
 
 
 def test_a_saved_map_is_localised_in(graph: Graph, frames: SyntheticSequence, saved_map: Path) -> None:
-    """From the start, at the pose that is given; the map stays as it is until mapping is switched on."""
+    """Loaded at start, at the given pose. The map does not change until mapping is enabled."""
     truth = frames.ground_truth().T_world_cam
     near, T = (np.linalg.inv(truth[0]) @ truth[view] for view in (10, 11))
     out = graph.folder / 'run'
@@ -132,9 +132,9 @@ def test_time_that_jumps_back(graph: Graph, frames: SyntheticSequence, policy: s
     expected = np.zeros(3) if policy == 'reset' else position(before[-1])
     for pose in after:
         assert pose is not None and np.linalg.norm(position(pose) - expected) < STILL_M
-    # Stamps of a trajectory increase: there is one of before, and one of after.
+    # The stamps of a trajectory increase, so there is one for before and one for after the jump.
     assert [len(read_run(path).trajectory) for path in (out, out / 'previous')] == [3, 4]
-    # And forward: nothing is reset, nothing freezes.
+    # A jump forward resets nothing, and processing continues.
     poses = [live.show(moving(frames, 5000 + number, 11)) for number in range(2)]
     assert np.linalg.norm(position(poses[-1]) - expected) < STILL_M
 
@@ -165,7 +165,7 @@ def test_a_gate_follows_time_back() -> None:
 
 
 def test_parameters_over_the_graph(graph: Graph, frames: SyntheticSequence) -> None:
-    """Refused ones change nothing; what is changed counts from the next frame on."""
+    """A refused change has no effect; an accepted one applies from the next frame on."""
     live = Live(graph)
     control = Control(graph)
     assert live.show(still(frames, 0))
@@ -176,7 +176,7 @@ def test_parameters_over_the_graph(graph: Graph, frames: SyntheticSequence) -> N
     assert [result.successful for result in results] == [False] * 5 + [True]
     assert 'out of range' in results[0].reason and 'cannot change while the node runs' in results[2].reason
     assert live.show(still(frames, 1))
-    control.change(slam__depth__min_m=50.0)  # no reading is as far as that
+    control.change(slam__depth__min_m=50.0)  # every reading is nearer
     assert live.show(still(frames, 2)) is None
     control.change(slam__depth__min_m=0.2)
     assert live.show(still(frames, 3))

@@ -31,7 +31,7 @@ STREAMS = ((CameraInfo, '/rgb/camera_info'), (Image, '/rgb/image'), (Image, '/de
 
 
 class Receiver:
-    """The node's inputs without the node."""
+    """The inputs of a node, without the node."""
 
     def __init__(self, graph: Graph, **options: Any) -> None:
         self.options = node_options(options)
@@ -113,7 +113,7 @@ def test_sim_time_without_a_clock(graph: Graph) -> None:
 
 
 def test_a_node_by_sim_time_says_that_the_clock_stands(graph: Graph) -> None:
-    """Its watch goes on by the steady clock; and images have stamps, so that those that come are processed."""
+    """The watchdog uses the steady clock. Images carry their own stamps, so they are processed all the same."""
     node = run_node(graph, use_sim_time=True, no_data_timeout=1.0)
     camera, done = Camera(graph), graph.collect(Header, '/splatam/processed')
     camera.wait_matched()
@@ -146,7 +146,7 @@ def test_best_effort_publishers(graph: Graph, reliability: str, is_heard: bool) 
 
 @pytest.mark.parametrize(('overridden', 'option'), [('best_effort', 'reliable'), ('reliable', 'auto')])
 def test_qos_overrides_have_the_last_word(graph: Graph, overridden: str, option: str) -> None:
-    """Of a topic, whatever input_reliability says."""
+    """They take precedence over input_reliability."""
     override = f'qos_overrides./rgb/image.subscription.reliability:={overridden}'
     node = graph.run_node('-p', override, preset='quick', input_reliability=option, no_data_timeout=1.0)
     color = Camera(graph, ReliabilityPolicy.BEST_EFFORT).publisher('rgb')

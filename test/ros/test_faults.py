@@ -1,4 +1,4 @@
-"""Faults tried on the running node, and what happens."""
+"""Faults caused on the running node, and its reactions."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ while True:
 
 
 def start_publisher(graph: Graph) -> Process:
-    """A camera in a process of its own, of a view that does not change, ten times a second."""
+    """Start a camera as a separate process that sends the same view ten times a second."""
     return graph.start('-c', PUBLISHER)
 
 
 def covered(frame: RgbdFrame) -> RgbdFrame:
-    """What a camera sees with a hand on it: black, and nothing to measure."""
+    """Returns what a covered camera sees: black, and no depth."""
     return replace(frame, rgb=np.zeros_like(frame.rgb), depth_m=np.zeros_like(frame.depth_m))
 
 
@@ -64,17 +64,17 @@ def test_a_publisher_that_is_killed_and_started_again(graph: Graph) -> None:
     first = start_publisher(graph)
     graph.spin_until(lambda: len(poses) >= 3, explain=lambda: node.text + first.text)
     first.send(signal.SIGKILL)
-    # The graph notices a process that vanished only after DDS's lease of some seconds; silence is noticed at once.
+    # The graph notices a killed process only after DDS's lease of some seconds; missing images are noticed earlier.
     node.wait_says('no frame for 1 s: nothing was received on /rgb/image and /depth/image')
     before = len(poses)
     second = start_publisher(graph)
     graph.spin_until(lambda: len(poses) >= before + 3, explain=lambda: node.text + second.text)
-    assert np.linalg.norm(position(poses[-1])) < STILL_M  # the map is the same, and so is the camera's place in it
+    assert np.linalg.norm(position(poses[-1])) < STILL_M  # the map is the same, and so is the pose
     assert node.is_running and not node.says('map reset')
 
 
 def test_a_covered_camera(graph: Graph, frames: SyntheticSequence) -> None:
-    """For 3 s: no pose, the map untouched, tracking again when the view returns. With lost_reset_after: a new map."""
+    """For 3 s: no pose, the map does not change, tracking resumes with the view. With lost_reset_after: a new map."""
     out = graph.folder / 'run'
     live = Live(graph, save_path=out, queue_policy='all', slam__tracking__min_inlier_fraction=0.5)
     control = Control(graph)
@@ -119,16 +119,16 @@ def test_camera_info_that_is_late(graph: Graph, frames: SyntheticSequence) -> No
         graph.spin_for(0.2)  # in a burst, three of one stream could push each other out before the other stream comes
     live.wait_says('no frame for 1 s: /rgb/camera_info has a publisher, but no message was received')
     live.wait_says('dropped: paired, but no CameraInfo was received')
-    graph.spin_for(9.0)  # with what has passed already, 10 s
+    graph.spin_for(9.0)  # 10 s in total
     assert not live.done
-    live.camera.send(still(frames, 6), only=('info',))  # as many as fit the queue have waited for it
+    live.camera.send(still(frames, 6), only=('info',))  # the frames in the queue have waited for it
     live.wait_done(still(frames, 5).stamp_ns)
     assert [stamps.to_ns(header.stamp) for header in live.done] == [still(frames, n).stamp_ns for n in (3, 4, 5)]
     assert live.show(still(frames, 7))
 
 
 def test_one_message_in_ten_is_lost(graph: Graph, frames: SyntheticSequence) -> None:
-    """Every frame both of whose images arrived has its pose; the others are told."""
+    """Every frame whose two images arrive gets a pose; the node warns about the others."""
     rng = np.random.default_rng(1)
     live = Live(graph, queue_policy='all', sync__mode='exact')
     live.show(still(frames, 0))
@@ -139,7 +139,7 @@ def test_one_message_in_ten_is_lost(graph: Graph, frames: SyntheticSequence) -> 
         if {'rgb', 'depth'} <= set(arriving):
             expected.append(still(frames, number).stamp_ns)
     live.wait_done(expected[-1])
-    assert 40 < len(expected) < 60  # some are lost indeed
+    assert 40 < len(expected) < 60  # some were lost
     assert [stamps.to_ns(header.stamp) for header in live.done][1:] == expected
     live.wait_says('dropped: colour without depth')
     live.wait(lambda: len(live.poses) > len(expected))
@@ -147,7 +147,7 @@ def test_one_message_in_ten_is_lost(graph: Graph, frames: SyntheticSequence) -> 
 
 
 def test_corrupted_compressed_frames(graph: Graph, frames: SyntheticSequence) -> None:
-    """Bytes flipped or cut off: a warning or a wrong picture, never the end; good frames go on."""
+    """Bytes flipped or cut off: a warning or a wrong image, but never a crash; good frames are tracked."""
     rng = np.random.default_rng(2)
     live = Live(
         graph, camera_class=CompressedCamera, queue_policy='all', slam__tracking__min_inlier_fraction=0.5,
@@ -176,7 +176,7 @@ def test_corrupted_compressed_frames(graph: Graph, frames: SyntheticSequence) ->
 
 
 def test_a_stamp_that_jumps_and_returns(graph: Graph, frames: SyntheticSequence) -> None:
-    """One message far in the future, and one in the past: what comes after them is tracked, nothing freezes."""
+    """One message far in the future, and one in the past: the frames after them are tracked."""
     live = Live(graph, on_time_jump='continue', queue_policy='all')
     assert live.show(still(frames, 0))
     for wrong_ns in (10**6 * SECOND, SECOND // 2):
@@ -196,12 +196,12 @@ def _shows_pose(live: Live, frame: RgbdFrame) -> bool:
 
 
 def limit_file_size(node: Process, num_bytes: int) -> None:
-    """Writing a file beyond this fails, as on a full disk."""
+    """Make writing beyond this size fail, as on a full disk."""
     resource.prlimit(node.pid, resource.RLIMIT_FSIZE, (num_bytes, resource.RLIM_INFINITY))
 
 
 def test_a_disk_that_is_full(graph: Graph, frames: SyntheticSequence) -> None:
-    """Saving fails with the reason, the file of before stays whole, SLAM goes on; with room again all is saved.
+    """Saving fails with the reason, the old file stays complete, SLAM continues; with space again everything is saved.
 
     That a frame could not be written down is said too, but here the node's log is on the full disk as well.
     """
@@ -222,7 +222,7 @@ def test_a_disk_that_is_full(graph: Graph, frames: SyntheticSequence) -> None:
     assert live.show(still(frames, 6))
     assert '7 frames' in control.succeed('save_map')
     assert (out / 'map.ply').read_bytes() != before and not list(out.glob('.*'))
-    assert len(read_run(out).trajectory) == 7  # what could not be written then is written now
+    assert len(read_run(out).trajectory) == 7  # including the frames that could not be written then
     live.node.send(signal.SIGINT)
     assert live.node.wait() == 0
 
@@ -243,7 +243,7 @@ sys.exit(main(sys.argv[1:]))
 
 
 def test_a_node_killed_while_it_saves(graph: Graph, frames: SyntheticSequence) -> None:
-    """The file of before stays whole, and the next run can take the folder over."""
+    """The old file stays complete, and the next run can use the folder."""
     out = graph.folder / 'run'
     camera, done = Camera(graph), graph.collect(Header, '/splatam/processed')
     node = graph.start('-c', SLOW_DISK, *node_arguments(preset='quick', save_path=out, **SLAM))
@@ -278,7 +278,7 @@ UNUSABLE = {
 
 
 def test_a_start_with_parameters_that_cannot_be_used(graph: Graph) -> None:
-    nodes = [graph.run_node('-p', rule, load_path='/nowhere.ply') for rule in UNUSABLE]  # together: starting takes long
+    nodes = [graph.run_node('-p', rule, load_path='/nowhere.ply') for rule in UNUSABLE]  # in parallel, because starting takes long
     for node, message in zip(nodes, UNUSABLE.values(), strict=True):
         assert node.wait(len(nodes) * TIMEOUT_S) == 2, node.text
         errors = [line for line in node.lines if 'error:' in line]

@@ -1,4 +1,4 @@
-"""Frames by REP 105 over DDS: what the node says on TF, what it hears there, and odometry to start from."""
+"""Coordinate frames (REP 105) over DDS: published TF, received TF, and odometry as the initial guess of tracking."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ NO_TIME = QosTime(0, 0)
 EXACT = 1e-9  # matrices to quaternions and back, and products of them, in float64
 
 
-class Ears:
-    """What a robot hears of the node."""
+class RobotListener:
+    """Collects what the node publishes for a robot."""
 
     def __init__(self, graph: Graph, tf_message: type | None = None) -> None:
         self.poses = graph.collect(PoseStamped, '/splatam/pose')
@@ -62,7 +62,7 @@ class Ears:
 
 
 def links(messages: list[Any]) -> dict[tuple[str, str], dict[int, np.ndarray]]:
-    """Transforms by (parent, child), and then by stamp."""
+    """Returns transforms by (parent, child), then by stamp."""
     found: dict[tuple[str, str], dict[int, np.ndarray]] = {}
     for transform in itertools.chain.from_iterable(message.transforms for message in messages):
         link = transform.header.frame_id, transform.child_frame_id
@@ -80,14 +80,14 @@ def static_message(tf_message: type, *transforms: tuple[str, str, np.ndarray]) -
     return tf_message(transforms=[poses.transform_stamped(MAKE, T, 0, *names) for *names, T in transforms])
 
 
-def process(graph: Graph, node: Process, camera: Camera, ears: Ears, sequence: Any) -> list[int]:
-    """Send frames, each when the one before is done; their stamps."""
+def process(graph: Graph, node: Process, camera: Camera, listener: RobotListener, sequence: Any) -> list[int]:
+    """Send frames one after the other, each when the previous one is processed. Returns their stamps."""
     camera.wait_matched()
     sent = []
     for frame in sequence:
         camera.send(frame)
         sent.append(frame.stamp_ns)
-        graph.spin_until(lambda: ears.done and stamps.to_ns(ears.done[-1].stamp) == sent[-1], explain=lambda: node.text)
+        graph.spin_until(lambda: listener.done and stamps.to_ns(listener.done[-1].stamp) == sent[-1], explain=lambda: node.text)
     return sent
 
 
@@ -96,32 +96,32 @@ def assert_close(found: np.ndarray, expected: np.ndarray) -> None:
 
 
 def test_an_upright_robot_with_its_extrinsic_as_a_parameter(graph: Graph, tf_message: type, frames: SyntheticSequence) -> None:
-    camera, ears = Camera(graph), Ears(graph, tf_message)
+    camera, listener = Camera(graph), RobotListener(graph, tf_message)
     clouds = graph.collect(PointCloud2, '/splatam/map/points', LATCHED)
     node = run_node(
         graph, '-p', f'camera_in_base:="{CAMERA_IN_BASE}"', base_frame='base_link', world_up='z_up', queue_policy='all',
     )  # fmt: skip
     graph.spin_until(lambda: graph.node.count_publishers('/tf') and graph.node.count_publishers('/tf_static'),
                      explain=lambda: node.text)  # fmt: skip
-    sent = process(graph, node, camera, ears, list(frames)[:4])
+    sent = process(graph, node, camera, listener, list(frames)[:4])
     odom_base, map_odom = ('odom', 'base_link'), ('map', 'odom')
-    graph.spin_until(lambda: len(ears.odometry) == 4 and ears.fixed and sent[-1] in ears.moving.get(odom_base, {}))
+    graph.spin_until(lambda: len(listener.odometry) == 4 and listener.fixed and sent[-1] in listener.moving.get(odom_base, {}))
 
-    assert ears.moving.keys() == {map_odom, odom_base} and ears.fixed.keys() == {('base_link', CAMERA_FRAME)}
-    (T_base_camera,) = ears.fixed['base_link', CAMERA_FRAME].values()
+    assert listener.moving.keys() == {map_odom, odom_base} and listener.fixed.keys() == {('base_link', CAMERA_FRAME)}
+    (T_base_camera,) = listener.fixed['base_link', CAMERA_FRAME].values()
     assert_close(T_base_camera, T_BASE_CAMERA)
     slam = Slam(load_config('quick', {name.removeprefix('slam__').replace('__', '.'): v for name, v in SLAM.items()}))
     for frame, stamp_ns in zip(frames, sent):
         T_world_cam = slam.process(frame).T_world_cam
-        # The map begins where the base began, so the robot drives on its floor.
+        # The map begins at the first base, so the robot drives on the floor of the map.
         T_map_base = T_BASE_CAMERA @ T_world_cam @ se3.inverse(T_BASE_CAMERA)
-        assert_close(by_stamp(ears.odometry)[stamp_ns], T_map_base)
-        assert_close(by_stamp(ears.poses)[stamp_ns], T_BASE_CAMERA @ T_world_cam)
-        for T in (ears.moving[map_odom].get(stamp_ns), np.eye(4)):
+        assert_close(by_stamp(listener.odometry)[stamp_ns], T_map_base)
+        assert_close(by_stamp(listener.poses)[stamp_ns], T_BASE_CAMERA @ T_world_cam)
+        for T in (listener.moving[map_odom].get(stamp_ns), np.eye(4)):
             assert T is None or (np.eye(4) == T).all()
-        if stamp_ns in ears.moving[odom_base]:  # the subscription may be discovered after the first frames
-            assert_close(ears.moving[odom_base][stamp_ns], T_map_base)
-    assert {(m.header.frame_id, m.child_frame_id) for m in ears.odometry} == {('map', 'base_link')}
+        if stamp_ns in listener.moving[odom_base]:  # the subscription may be discovered after the first frames
+            assert_close(listener.moving[odom_base][stamp_ns], T_map_base)
+    assert {(m.header.frame_id, m.child_frame_id) for m in listener.odometry} == {('map', 'base_link')}
 
     graph.spin_until(lambda: clouds and stamps.message_stamp_ns(clouds[-1]) == sent[-1])
     points, _ = point_clouds.read_cloud(clouds[-1])
@@ -130,12 +130,12 @@ def test_an_upright_robot_with_its_extrinsic_as_a_parameter(graph: Graph, tf_mes
 
 
 def test_an_extrinsic_on_tf_static_is_waited_for(graph: Graph, tf_message: type, frames: SyntheticSequence) -> None:
-    camera, ears = Camera(graph), Ears(graph, tf_message)
+    camera, listener = Camera(graph), RobotListener(graph, tf_message)
     node = run_node(graph, base_frame='base_link', odom_frame='""', queue_policy='all')
-    first = process(graph, node, camera, ears, [still(frames, 0)])
+    first = process(graph, node, camera, listener, [still(frames, 0)])
     node.wait_says('WARN', "nothing is published: the pose of 'camera_optical_frame' in 'base_link' is not known",
                    "no transform connects 'camera_optical_frame' to 'base_link'")  # fmt: skip
-    assert not (ears.poses or ears.odometry)
+    assert not (listener.poses or listener.odometry)
 
     T_base_link, T_link_camera = T_BASE_CAMERA @ se3.inverse(T_BODY_OPTICAL), T_BODY_OPTICAL
     robot = graph.publisher(tf_message, '/tf_static', LATCHED)
@@ -145,20 +145,20 @@ def test_an_extrinsic_on_tf_static_is_waited_for(graph: Graph, tf_message: type,
     numbers = itertools.count(1)
 
     def go_on() -> bool:
-        process(graph, node, camera, ears, [still(frames, next(numbers))])
-        return bool(ears.odometry)
+        process(graph, node, camera, listener, [still(frames, next(numbers))])
+        return bool(listener.odometry)
 
     graph.spin_until(go_on, explain=lambda: node.text)
-    graph.spin_until(lambda: ears.moving, explain=lambda: node.text)
-    assert first[0] not in by_stamp(ears.poses)
-    assert ears.moving.keys() == {('map', 'base_link')}
-    assert ears.fixed.keys() == {('base_link', 'camera_link'), ('camera_link', CAMERA_FRAME)}  # the robot's, not ours
-    for stamp_ns, T_map_base in by_stamp(ears.odometry).items():
-        assert_close(T_map_base @ T_BASE_CAMERA, by_stamp(ears.poses)[stamp_ns])
+    graph.spin_until(lambda: listener.moving, explain=lambda: node.text)
+    assert first[0] not in by_stamp(listener.poses)
+    assert listener.moving.keys() == {('map', 'base_link')}
+    assert listener.fixed.keys() == {('base_link', 'camera_link'), ('camera_link', CAMERA_FRAME)}  # the robot's, not ours
+    for stamp_ns, T_map_base in by_stamp(listener.odometry).items():
+        assert_close(T_map_base @ T_BASE_CAMERA, by_stamp(listener.poses)[stamp_ns])
 
 
 def record_with_robot(bag: Path, path: Path) -> None:
-    """The recording, with the robot's transforms on /tf_static before the first image."""
+    """Write a copy of the recording with the robot's transforms on /tf_static before the first image."""
     store = get_typestore(Stores.ROS2_JAZZY)
     name = 'tf2_msgs/msg/TFMessage'
     transform = poses.transform_stamped(RosbagsMessages(store), T_BASE_CAMERA, 0, 'base_link', CAMERA_FRAME)
@@ -175,7 +175,7 @@ def record_with_robot(bag: Path, path: Path) -> None:
 def test_a_recorded_extrinsic_arrives_though_playback_starts_later(
     graph: Graph, tf_message: type, bag: Path, frames: SyntheticSequence
 ) -> None:
-    """And all under other names: the player's remaps, and the node's."""
+    """All topics are remapped, by the player and by the node."""
     record_with_robot(bag, graph.folder / 'robot')
     odometry = graph.collect(Odometry, '/robot/splatam/odometry')
     node = run_node(
@@ -198,7 +198,7 @@ def test_a_recorded_extrinsic_arrives_though_playback_starts_later(
 
 
 def test_a_camera_with_a_parent_gets_no_second_one(graph: Graph, tf_message: type, frames: SyntheticSequence) -> None:
-    camera, ears = Camera(graph), Ears(graph, tf_message)
+    camera, listener = Camera(graph), RobotListener(graph, tf_message)
     driver = graph.publisher(tf_message, '/tf_static', LATCHED)
     driver.publish(static_message(
         tf_message, ('camera_link', 'camera', np.eye(4)), ('camera', CAMERA_FRAME, np.eye(4))
@@ -206,26 +206,26 @@ def test_a_camera_with_a_parent_gets_no_second_one(graph: Graph, tf_message: typ
     node = run_node(graph, queue_policy='all')
     graph.spin_until(lambda: driver.get_subscription_count() == 2, explain=lambda: node.text)  # the test's, the node's
     graph.spin_for(0.5)  # a latched message has no answer
-    process(graph, node, camera, ears, [still(frames, number) for number in range(2)])
+    process(graph, node, camera, listener, [still(frames, number) for number in range(2)])
     node.wait_says('WARN', "on /tf_static 'camera_optical_frame' is fixed to 'camera'", "set base_frame to 'camera_link'")
-    graph.spin_until(lambda: len(ears.odometry) == 2)
-    assert ears.odometry[-1].child_frame_id == CAMERA_FRAME  # everything else works
-    assert not ears.moving
+    graph.spin_until(lambda: len(listener.odometry) == 2)
+    assert listener.odometry[-1].child_frame_id == CAMERA_FRAME  # everything else works
+    assert not listener.moving
 
 
 def test_without_base_and_without_odom_frame_the_camera_is_in_the_map(
     graph: Graph, tf_message: type, frames: SyntheticSequence
 ) -> None:
-    camera, ears = Camera(graph), Ears(graph, tf_message)
+    camera, listener = Camera(graph), RobotListener(graph, tf_message)
     node = run_node(graph, queue_policy='all', camera_frame='eye', world_up='z_up', map_frame='world', odom_frame='drifting')
     graph.spin_until(lambda: graph.node.count_publishers('/tf'), explain=lambda: node.text)
-    sent = process(graph, node, camera, ears, list(frames)[:3])
-    graph.spin_until(lambda: sent[-1] in ears.moving.get(('drifting', 'eye'), {}))
-    assert ears.moving.keys() == {('world', 'drifting'), ('drifting', 'eye')} and not ears.fixed
-    first = by_stamp(ears.poses)[sent[0]]
+    sent = process(graph, node, camera, listener, list(frames)[:3])
+    graph.spin_until(lambda: sent[-1] in listener.moving.get(('drifting', 'eye'), {}))
+    assert listener.moving.keys() == {('world', 'drifting'), ('drifting', 'eye')} and not listener.fixed
+    first = by_stamp(listener.poses)[sent[0]]
     assert_close(first[:3, :3] @ [0, 0, 1], np.array([1, 0, 0]))  # looks along the map's x
     assert_close(first[:3, :3] @ [0, -1, 0], np.array([0, 0, 1]))  # its top is up
-    assert {message.header.frame_id for message in ears.poses} == {'world'}
+    assert {message.header.frame_id for message in listener.poses} == {'world'}
 
 
 WITHOUT_TF2 = """
@@ -237,24 +237,24 @@ sys.exit(main(sys.argv[1:]))
 
 
 def test_without_tf2_one_warning_and_all_else_works(graph: Graph, frames: SyntheticSequence) -> None:
-    camera, ears = Camera(graph), Ears(graph)
+    camera, listener = Camera(graph), RobotListener(graph)
     arguments = node_arguments(
         '-p', f'camera_in_base:="{CAMERA_IN_BASE}"', preset='quick', queue_policy='all', base_frame='base_link',
         no_data_timeout=60.0, **SLAM,
     )  # fmt: skip
     node = graph.start('-c', WITHOUT_TF2, *arguments)
-    sent = process(graph, node, camera, ears, list(frames)[:3])
-    graph.spin_until(lambda: len(ears.odometry) == len(ears.poses) == 3, explain=lambda: node.text)
+    sent = process(graph, node, camera, listener, list(frames)[:3])
+    graph.spin_until(lambda: len(listener.odometry) == len(listener.poses) == 3, explain=lambda: node.text)
     warnings = [line for line in node.lines if 'WARN' in line]
     assert len(warnings) == 1 and 'tf2_msgs is not installed' in warnings[0]
-    assert_close(by_stamp(ears.odometry)[sent[-1]] @ T_BASE_CAMERA, by_stamp(ears.poses)[sent[-1]])
+    assert_close(by_stamp(listener.odometry)[sent[-1]] @ T_BASE_CAMERA, by_stamp(listener.poses)[sent[-1]])
     assert graph.node.count_publishers('/tf') == 0
 
 
 def test_publish_tf_off_is_silent_on_tf(graph: Graph, tf_message: type, frames: SyntheticSequence) -> None:
-    camera, ears = Camera(graph), Ears(graph)
+    camera, listener = Camera(graph), RobotListener(graph)
     node = run_node(graph, publish_tf=False, queue_policy='all')
-    process(graph, node, camera, ears, [still(frames, 0)])
+    process(graph, node, camera, listener, [still(frames, 0)])
     assert graph.node.count_publishers('/tf') == graph.node.count_publishers('/tf_static') == 0
 
 
@@ -282,14 +282,14 @@ def test_such_a_refusal_is_one_line(graph: Graph) -> None:
 
 # --- odometry to start tracking from ---
 
-EVERY = 15  # frames of the walk: 10° and 13 cm between two images, more than a tracker finds by itself
+EVERY = 15  # frames of the walk: 10° and 13 cm between two images, more than tracking finds without a guess
 FAST = {'mapping.iterations': 10, 'mapping.every': 1, 'threads': 1}
 T_ODOM_START = se3.exp(np.array([3.0, -1.0, 0.2, 0.1, -0.2, 0.7]))  # odometry began elsewhere
 DRIFT_PER_S = np.array([0.01, 0.005, 0, 0, 0, 0.01])
 
 
 class Robot:
-    """A robot that runs fast, and its drifting odometry."""
+    """A fast robot with drifting odometry."""
 
     def __init__(self, room: Callable[..., SyntheticSequence]) -> None:
         sequence = room(frames=4 * EVERY + 1, width=96, noise=False)
@@ -337,7 +337,7 @@ def test_slam_starts_from_the_prior(robot: Robot) -> None:
 
 @pytest.mark.parametrize('source', ['tf', 'topic'])
 def test_odometry_is_where_tracking_starts_and_is_corrected(graph: Graph, tf_message: type, robot: Robot, source: str) -> None:
-    camera, ears = Camera(graph), Ears(graph, tf_message)
+    camera, listener = Camera(graph), RobotListener(graph, tf_message)
     wheels = graph.publisher(tf_message, '/tf', TF) if source == 'tf' else graph.publisher(Odometry, '/odom')
     slam = {f'slam.{name}': value for name, value in FAST.items()}
     node = graph.run_node(
@@ -358,23 +358,23 @@ def test_odometry_is_where_tracking_starts_and_is_corrected(graph: Graph, tf_mes
             wheels.publish(poses.odometry(
                 MAKE, T, stamp_ns, 'odom', 'base_link', pose_covariance=zeros, twist=zeros[0], twist_covariance=zeros
             ))  # fmt: skip
-    sent = process(graph, node, camera, ears, robot.frames)
+    sent = process(graph, node, camera, listener, robot.frames)
     map_odom = 'map', 'odom'
-    graph.spin_until(lambda: len(ears.odometry) == len(sent) and sent[-1] in ears.moving.get(map_odom, {}),
+    graph.spin_until(lambda: len(listener.odometry) == len(sent) and sent[-1] in listener.moving.get(map_odom, {}),
                      explain=lambda: node.text)  # fmt: skip
     assert 'WARN' not in node.text
-    for stamp_ns, T_world_cam in by_stamp(ears.poses).items():
+    for stamp_ns, T_world_cam in by_stamp(listener.poses).items():
         assert robot.error_m(stamp_ns, T_world_cam) < TRACKED_M
-    # Map to odom to base is where the base is, though the odometry drifts; the node does not say odom to base again.
-    T_map_base = by_stamp(ears.odometry)
-    for stamp_ns, T_map_odom in ears.moving[map_odom].items():
+    # Map to odom to base is the pose of the base, although the odometry drifts; the node does not publish odom to base.
+    T_map_base = by_stamp(listener.odometry)
+    for stamp_ns, T_map_odom in listener.moving[map_odom].items():
         # Odometry between two of its poses is interpolated along a screw; the walk is nearly that over 0.07 s.
         np.testing.assert_allclose(T_map_odom @ robot.odometry(stamp_ns), T_map_base[stamp_ns], atol=2e-3)
-    assert set(ears.moving.get(('odom', 'base_link'), {})) <= set(robot.stamps_ns[::2])
+    assert set(listener.moving.get(('odom', 'base_link'), {})) <= set(robot.stamps_ns[::2])
 
 
 def test_without_odometry_constant_velocity_and_one_warning(graph: Graph, tf_message: type, frames: SyntheticSequence) -> None:
-    camera, ears = Camera(graph), Ears(graph, tf_message)
+    camera, listener = Camera(graph), RobotListener(graph, tf_message)
     wheels = graph.publisher(Odometry, '/odom')
     node = run_node(graph, queue_policy='all', odom__source='topic', odom__max_wait=0.05)
     graph.spin_until(wheels.get_subscription_count, explain=lambda: node.text)
@@ -382,8 +382,8 @@ def test_without_odometry_constant_velocity_and_one_warning(graph: Graph, tf_mes
         MAKE, np.eye(4), 1, 'vio', 'camera', pose_covariance=np.eye(6), twist=np.zeros(6), twist_covariance=np.eye(6)
     )
     wheels.publish(elsewhere)
-    process(graph, node, camera, ears, [still(frames, number) for number in range(4)])
-    graph.spin_until(lambda: len(ears.poses) == 4, explain=lambda: node.text)
+    process(graph, node, camera, listener, [still(frames, number) for number in range(4)])
+    graph.spin_until(lambda: len(listener.poses) == 4, explain=lambda: node.text)
     assert len([line for line in node.lines if 'constant velocity is used instead' in line]) == 1
     assert node.says('WARN', "/odom is in the frame 'vio', but odom_frame is 'odom'; set it to 'vio'")
-    assert not ears.moving  # the correction of an odometry that is not known is not known
+    assert not listener.moving  # without odometry there is no correction

@@ -1,4 +1,4 @@
-"""From messages to frames: sizes, rectification, cameras that change, and what is said about input that may not fit."""
+"""From messages to frames: sizes, rectification, a changing camera, and warnings about input that may be wrong."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_maps_are_computed_once_a_camera(make_bench: Callable[..., Bench], monke
 
 def test_camera_info_of_zeros_changes_nothing(make_bench: Callable[..., Bench]) -> None:
     bench = make_bench()
-    assert bench.feed(SECOND, info=info(k=[0.0] * 9)) == []  # waits for one that makes sense
+    assert bench.feed(SECOND, info=info(k=[0.0] * 9)) == []  # waits for a valid one
     first, second = bench.feed(2 * SECOND)
     assert (first.stamp_ns, second.stamp_ns) == (SECOND, 2 * SECOND)
     (frame,) = bench.feed(3 * SECOND, info=info(k=[0.0] * 9))
@@ -182,7 +182,7 @@ def test_a_jump_back_begins_an_epoch(make_bench: Callable[..., Bench]) -> None:
 
 
 def padded(pixels: np.ndarray) -> dict[str, Any]:
-    """Step and data of pixels whose rows are five bytes longer than they need be."""
+    """Returns step and data of an image whose rows are padded by five bytes."""
     rows = np.ascontiguousarray(pixels).reshape(len(pixels), -1).view(np.uint8)
     rows = np.hstack([rows, np.full((len(rows), 5), 170, np.uint8)])
     return {'step': rows.shape[1], 'data': rows.tobytes()}
@@ -209,7 +209,7 @@ def from_millimetres(counts: np.ndarray) -> np.ndarray:
     return counts.astype(np.float32) / np.float32(1000)
 
 
-# By encoding: how it is written, and what is to be read. OpenCV's names of today say what ROS's say.
+# By encoding: a function that encodes, and one that returns the expected decoded image.
 COLOURS = {
     'bgr8': (lambda rgb: rgb[..., ::-1], lambda bgr: bgr[..., ::-1].copy()),
     'rgba8': (lambda rgb: np.dstack([rgb, np.full(rgb.shape[:2], 7, np.uint8)]), lambda rgba: rgba[..., :3].copy()),
@@ -231,14 +231,14 @@ DEPTHS = {
 
 
 class Twins:
-    """A node, and the same SLAM without one: what the node takes in is right if both find the same poses exactly."""
+    """A node, and the same SLAM without a node: if both find exactly the same poses, the node decodes correctly."""
 
     def __init__(self, graph: Graph, **options: Any) -> None:
         self.live = Live(graph, queue_policy='all', **options)
         self._slam = Slam(load_config('quick', QUICK))
 
     def assert_same(self, what: str, expected: RgbdFrame, sent: RgbdFrame | None = None, **changes: Any) -> None:
-        """What is sent is to be seen as what is expected."""
+        """Checks that the node sees the sent frame as the expected one."""
         pose = self.live.show(sent or expected, **changes)
         assert pose is not None, f'{what}: {self.live.node.text}'
         T_world_cam = self._slam.process(expected).T_world_cam
@@ -246,7 +246,7 @@ class Twins:
 
 
 def test_poses_tell_views_apart(frames: SyntheticSequence) -> None:
-    """What the tests below rest on: a little of colour or depth, and the pose is another."""
+    """The tests below rely on this: a small change of colour or depth changes the pose."""
     first, second = still(frames, 0), still(frames, 1)
     red_for_blue = replace(second, rgb=second.rgb[..., ::-1].copy())
     one_pixel = second.depth_m.copy()
@@ -272,7 +272,7 @@ def test_every_encoding_reaches_slam_as_the_same_view(graph: Graph, frames: Synt
 
 
 def part_of_a_larger_sensor(frame: RgbdFrame) -> dict[str, Any]:
-    """CameraInfo of a sensor of which every second pixel of a part makes the frame."""
+    """Returns changes of CameraInfo: the frame is every second pixel of a part of a larger sensor."""
     c, x, y = frame.camera, 16, 12
     k = [2 * c.fx, 0.0, 2 * c.cx + 0.5 + x, 0.0, 2 * c.fy, 2 * c.cy + 0.5 + y, 0.0, 0.0, 1.0]
     roi = RegionOfInterest(x_offset=x, y_offset=y, width=2 * c.width, height=2 * c.height)
@@ -283,8 +283,8 @@ def part_of_a_larger_sensor(frame: RgbdFrame) -> dict[str, Any]:
 
 
 def test_every_camera_reaches_slam_as_the_same_view(graph: Graph, frames: SyntheticSequence) -> None:
-    """Lenses, parts of sensors, smaller depth, depth in other steps, late depth; another camera would start a new map."""
-    twins = Twins(graph, sync__max_interval=0.1, depth_scale=0.0002)  # which floats, metres, are not concerned by
+    """Lenses, parts of sensors, smaller depth, depth in other steps, late depth; a wrong camera would start a new map."""
+    twins = Twins(graph, sync__max_interval=0.1, depth_scale=0.0002)  # which does not apply to 32FC1, in metres
     numbers = itertools.count()
     twins.assert_same('pinhole', still(frames, next(numbers)))
     for model, d in COEFFICIENTS:

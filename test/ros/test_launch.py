@@ -1,4 +1,4 @@
-"""What is shipped to start the node with."""
+"""Launch files and parameter files."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def test_parameter_files_hold_known_names_and_allowed_values(graph: Graph, path:
 
 
 class Recorder:
-    """Stands in for a class of ``launch``, which pip does not have: remembers what it was made of."""
+    """Stands in for a class of ``launch``, which pip does not have; records its arguments."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.args, self.kwargs = args, kwargs
 
     def find(self, name: str) -> Iterator[Recorder]:
-        """Every recorded object of a class in what this one was made of."""
+        """Yields every recorded object of a class among the arguments, recursively."""
         yield from _find((self.args, self.kwargs), name)
 
     def perform(self, context: Mapping[str, str]) -> str:
@@ -69,7 +69,7 @@ def _find(value: Any, name: str) -> Iterator[Recorder]:
 
 @pytest.fixture
 def describe(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Recorder]:
-    """Run a launch file's ``generate_launch_description``."""
+    """Returns a function that runs a launch file's ``generate_launch_description``."""
 
     def run(name: str) -> Recorder:
         source = (LAUNCH / name).read_text()
@@ -91,7 +91,7 @@ FILES = ('splatam.launch.py', 'camera.launch.py', 'bag.launch.py')
 
 @pytest.mark.parametrize('name', FILES)
 def test_launch_files_use_arguments_that_they_declare(describe: Callable[[str], Recorder], name: str) -> None:
-    """And no other; what an argument is for is said."""
+    """They use all of them, no others, and each has a description."""
     description = describe(name)
     declared = {argument.args[0] for argument in description.find('DeclareLaunchArgument')}
     assert all(argument.kwargs['description'] for argument in description.find('DeclareLaunchArgument'))

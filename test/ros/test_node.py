@@ -1,4 +1,4 @@
-"""The node as a process of its own, over DDS."""
+"""The node as a separate process, over DDS."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def trajectory_lines(folder: Path) -> list[str]:
 
 
 def newest_stamp(messages: list[Any]) -> int | None:
-    """Of messages with a header, or that are headers."""
+    """Returns the newest stamp of messages that have a header or are headers."""
     header = getattr(messages[-1], 'header', messages[-1]) if messages else None
     return None if header is None else stamps.to_ns(header.stamp)
 
@@ -50,7 +50,7 @@ def offline(sequence: SyntheticSequence) -> tuple[Slam, list[np.ndarray]]:
     return slam, [slam.process(frame).T_world_cam for frame in sequence]
 
 
-# --- the whole way ---
+# --- from images to outputs ---
 
 
 def test_recording_in_poses_renders_cloud_and_folder_out(
@@ -81,10 +81,10 @@ def test_recording_in_poses_renders_cloud_and_folder_out(
     assert stamps_of(received['pose']) == stamps_of(received['odometry']) == expected_ns
     assert [stamps.to_ns(message.stamp) for message in received['processed']] == expected_ns
     for topic in ('path', 'render/rgb', 'render/depth', 'render/silhouette', 'map/points'):
-        # Their subscriptions may be discovered after the first frames; what comes is of frames, in order.
+        # Their subscriptions may be discovered after the first frames.
         assert set(stamps_of(received[topic])) <= set(expected_ns)
 
-    # The same frames offline, to the last bit.
+    # Equal to the same frames processed offline, bit for bit.
     slam, expected_poses = offline(frames)
     for message, T_world_cam in zip(received['pose'], expected_poses, strict=True):
         assert message == poses.pose_stamped(MAKE, T_world_cam, stamps.message_stamp_ns(message), 'map')
@@ -97,7 +97,7 @@ def test_recording_in_poses_renders_cloud_and_folder_out(
 
 
 def test_realtime_through_the_node_is_realtime_offline(graph: Graph, bag: Path, frames: SyntheticSequence) -> None:
-    """Poses and map to the last bit, the steps after the last frame among them, however long those take."""
+    """Poses and map are equal bit for bit, including the final steps after the last frame, however long they take."""
     out = graph.folder / 'run'
     node = graph.run_node(
         preset='realtime', slam__threads=1, save_path=out, queue_policy='all', exit_on_publisher_end=True, finish_limit=0.1
@@ -142,7 +142,7 @@ def check_folder(out: Path, expected_ns: list[int], expected_poses: list[np.ndar
 def test_a_recording_that_is_over_before_the_first_frame_is_done_is_processed_to_its_end(
     graph: Graph, bag: Path, frames: SyntheticSequence
 ) -> None:
-    """Nobody holds the player up: what SLAM has no time for waits in the transport."""
+    """Nothing slows the player down: frames for which SLAM is too slow wait in the transport."""
     out = graph.folder / 'run'
     node = run_node(graph, save_path=out, queue_policy='all', queue_size=1, exit_on_publisher_end=True)
     player = graph.play(str(bag), '--rate', 'max')
@@ -160,7 +160,7 @@ def test_compressed_recordings(graph: Graph, frames: SyntheticSequence) -> None:
     player = graph.play(str(graph.folder / 'compressed'), '--rate', 'max', '--wait-for')
     assert (player.wait(), node.wait()) == (0, 0), player.text + node.text
     run = read_run(out)
-    # Lost or not is no matter here; 32 pixels are few to find one's way by.
+    # Frames may be lost: 32 pixels are too few for reliable tracking.
     assert sorted([*run.trajectory.stamps_ns, *run.lost_ns]) == [frame.stamp_ns for frame in frames]
     assert (run.camera.width, run.camera.height) == (32, 24)
 
@@ -204,7 +204,7 @@ def test_live_the_newest_frames_are_taken_and_the_others_counted(graph: Graph, f
 
 
 def test_queued_frames_are_published_under_their_own_frame_ids(graph: Graph, frames: SyntheticSequence) -> None:
-    """Not under that of the newest image: both frames are assembled before SLAM is done with the first."""
+    """Both frames are assembled before SLAM finishes the first; its outputs must not get the frame id of the second."""
     go = graph.folder / 'go'
     camera, diagnostics = Camera(graph), graph.collect(DiagnosticArray, '/diagnostics')
     odometry, renders = graph.collect(Odometry, '/splatam/odometry'), graph.collect(Image, '/splatam/render/rgb')
@@ -230,7 +230,7 @@ def test_queued_frames_are_published_under_their_own_frame_ids(graph: Graph, fra
 
 
 def test_a_recording_in_a_loop_with_its_clock(graph: Graph, bag: Path, frames: SyntheticSequence) -> None:
-    """Sim time and stamps jump back together: each loop is a map of its own, and nothing freezes."""
+    """Sim time and stamps jump back together: each loop gets its own map, and processing never stops."""
     done, tracked = graph.collect(Header, '/splatam/processed'), graph.collect(PoseStamped, '/splatam/pose')
     diagnostics = graph.collect(DiagnosticArray, '/diagnostics')
     node = run_node(graph, queue_policy='all', use_sim_time=True, no_data_timeout=1.0, time_jump_threshold=0.2)
@@ -246,15 +246,15 @@ def test_a_recording_in_a_loop_with_its_clock(graph: Graph, bag: Path, frames: S
         assert stamps_of(of_loop) == expected_ns[:FRAMES]
         assert [pose.pose for pose in of_loop] == [pose.pose for pose in tracked[:FRAMES]]  # from the start, each time
     assert sum('map reset: time jumped back' in line for line in node.lines) >= 2
-    assert stamps_of(diagnostics)[-1] < 60 * 10**9  # by sim time, of a recording that begins at 1 s
+    assert stamps_of(diagnostics)[-1] < 60 * 10**9  # sim time; the recording begins at 1 s
     assert node.is_running and not node.says('use_sim_time is true')
 
 
-# --- ends of all kinds ---
+# --- shutdown, signals and crashes ---
 
 
 def start_playback(graph: Graph, bag: Path, **parameters: Any) -> tuple[Process, Process, Path]:
-    """Node and player, with a third of the recording done."""
+    """Start node and player, and wait until a third of the recording is processed."""
     out = graph.folder / 'run'
     node = run_node(graph, save_path=out, queue_policy='all', **parameters)
     player = graph.play(str(bag), '--rate', '1', '--wait-for')
@@ -266,7 +266,7 @@ def start_playback(graph: Graph, bag: Path, **parameters: Any) -> tuple[Process,
 def test_signals_in_mid_run_leave_a_whole_folder(graph: Graph, bag: Path, number: signal.Signals) -> None:
     node, player, out = start_playback(graph, bag)
     node.send(number)
-    node.send(signal.SIGINT)  # an impatient user; must not get in the way of saving
+    node.send(signal.SIGINT)  # an impatient user; must not interrupt saving
     assert node.wait() == 0, node.text
     assert node.says('saved', 'frames') and 'Traceback' not in node.text
     run = read_run(out)
@@ -274,7 +274,7 @@ def test_signals_in_mid_run_leave_a_whole_folder(graph: Graph, bag: Path, number
     assert len(run.trajectory) == len(run.frames) == metrics['frames'] == metrics['tracked'] >= 4
     assert len(read_ply(out / 'map.ply').means) == metrics['num_gaussians']
     assert not list(out.glob('*.tmp*'))
-    assert player.wait() == 1, player.text  # it played for somebody who left
+    assert player.wait() == 1, player.text  # the node it played for has left
     assert player.says('left in mid-playback')
 
 
@@ -282,13 +282,13 @@ def test_a_killed_node_loses_nothing_and_the_player_says_which_frame_is_missing(
     node, player, out = start_playback(graph, bag)
     node.send(signal.SIGKILL)
     player.wait_says('no answer on /splatam/pose', 'still waiting')
-    assert player.wait() == 1  # after the ten seconds for which a process may be silent
+    assert player.wait() == 1  # after the ten seconds for which a process may not respond
     lines = trajectory_lines(out)
     assert len(read_run(out).trajectory) == len(lines) >= 4
     error = next(line for line in player.lines if 'error:' in line)
     assert 'left in mid-playback' in error
     missing = re.search(r'first frame not answered: (\S+) \(image (\d+)\)', error)
-    # What was answered had been written; one more may have been when the kill came between the two.
+    # Every answered frame was written; one more may be if the kill came between writing and answering.
     assert len(lines) in (int(missing[2]) - 1, int(missing[2]))
     assert missing[1] not in [line.split()[0] for line in lines[: int(missing[2]) - 1]]
 
@@ -359,7 +359,7 @@ def test_bad_input_is_a_warning_each_and_the_node_goes_on(graph: Graph, frames: 
     def send_good() -> None:
         frame = next(good)
         camera.send(frame)
-        # The frame before may have been good enough: with a camera info that makes no sense the last one counts.
+        # The bad frame itself may have been processed: an invalid camera info is ignored, and the last valid one is used.
         graph.spin_until(lambda: done and stamps.to_ns(done[-1].stamp) == frame.stamp_ns, explain=lambda: node.text)
 
     def send_bad(*expected: str, frame: RgbdFrame | None = None, **changes: Any) -> None:
@@ -421,7 +421,7 @@ def test_a_best_effort_camera_is_heard(graph: Graph, frames: SyntheticSequence) 
     sent = iter(range(10**6))
 
     def send() -> int:
-        """Best effort: the first messages may be lost, stamps must increase."""
+        """Send until a pose arrives: with best effort the first messages may be lost. Stamps must increase."""
         camera.send(replace(frames[0], stamp_ns=10**9 + 10**7 * next(sent)))
         return len(tracked)
 
@@ -454,7 +454,7 @@ UNUSABLE = {
 
 
 def test_unusable_parameters_are_one_line(graph: Graph) -> None:
-    nodes = [graph.run_node(*line.split()) for line in UNUSABLE]  # together, since starting takes longest
+    nodes = [graph.run_node(*line.split()) for line in UNUSABLE]  # in parallel, because starting takes longest
     for node, message in zip(nodes, UNUSABLE.values(), strict=True):
         assert node.wait(len(nodes) * TIMEOUT_S) == 2, node.text
         errors = [line for line in node.lines if 'error:' in line]
@@ -462,13 +462,13 @@ def test_unusable_parameters_are_one_line(graph: Graph) -> None:
 
 
 def test_what_overrides_nothing_is_told(graph: Graph) -> None:
-    """Misspelt, or before remapping: ROS itself says nothing."""
+    """An override that is misspelt or names a topic before remapping; ROS itself does not warn."""
     node = graph.run_node('-p', f'{OVERRIDE}.reliability:=best_effort', '-r', 'rgb/image:=/camera/color')
     node.wait_says('WARN', f"'{OVERRIDE}.reliability' has no effect", 'one of /rgb/camera_info, /camera/color')
 
 
 def test_a_run_without_a_frame_leaves_its_folder_empty(graph: Graph) -> None:
-    """So that the next start, with the camera plugged in, can have it."""
+    """The next start, with the camera plugged in, can use the folder."""
     out = graph.folder / 'run'
     for _ in range(2):
         node = run_node(graph, save_path=out)

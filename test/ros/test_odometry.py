@@ -1,4 +1,4 @@
-"""Velocity and covariance in closed form, and the path's bound."""
+"""Velocity and covariance compared with closed forms, and the bound of the path."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_pose_that_fewer_pixels_support_is_less_sure(estimator: MotionEstimato
 
 
 def test_covariances_are_what_perturbed_poses_show(estimator: MotionEstimator) -> None:
-    """Monte Carlo: the camera's pose is perturbed as the parameters say; the body's scatters as stated."""
+    """Monte Carlo: the camera's pose is perturbed with the parameters; the body's must scatter with the stated covariance."""
     rng = np.random.default_rng(0)
     T_before, T_now = (se3.exp(np.array([1, 2, 3, 0.5, 0.1, 1.2])) @ se3.exp(TWIST * s) for s in (0.0, 0.1))
     observe(estimator, 0, T_before)

@@ -1,4 +1,4 @@
-"""What leaves the node, over DDS: silence while lost, diagnostics, the map for whoever comes late, and the viewers."""
+"""Outputs over DDS: nothing while lost, diagnostics, latched topics for late subscribers, and configurations of viewers."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 
 
 def covered(frame: RgbdFrame) -> RgbdFrame:
-    """What a camera sees through a hand: nothing at any distance it can measure."""
+    """Returns what a covered camera sees: no depth in its range."""
     return replace(frame, depth_m=np.full_like(frame.depth_m, 0.05))
 
 
@@ -90,7 +90,7 @@ def test_a_covered_camera_is_lost_in_silence_and_found_again(graph: Graph, tf_me
     graph.spin_until(lambda: diagnostics.values('tracking')['frames tracked'] == '2', explain=lambda: node.text)
     assert diagnostics.level('tracking') == OK and diagnostics.values('tracking')['status'] == 'tracked'
     graph.spin_until(lambda: len(heard['pose']) == len(heard['odometry']) == 3 and heard['tf'], explain=lambda: node.text)
-    for latched in ('path', 'map/points'):  # whoever subscribed late is sent the newest
+    for latched in ('path', 'map/points'):  # a late subscriber gets the newest message
         graph.spin_until(lambda: newest_stamp(heard[latched]) == still(frames, 2).stamp_ns)  # noqa: B023
     assert float(diagnostics.values('tracking')['inlier fraction']) > 0.5
     gaussians = diagnostics.values('map')['Gaussians']
@@ -108,12 +108,12 @@ def test_a_covered_camera_is_lost_in_silence_and_found_again(graph: Graph, tf_me
     graph.spin_until(lambda: diagnostics.level('tracking') == OK, explain=lambda: node.text)
     graph.spin_until(lambda: newest_stamp(heard['odometry']) == still(frames, 6).stamp_ns)
     found = heard['odometry'][-1]
-    assert found.twist.covariance[0] == 1e6  # how it came here is not known
-    assert heard['odometry'][2].twist.covariance[0] < 1  # as it was before
+    assert found.twist.covariance[0] == 1e6  # the motion while lost is not known
+    assert heard['odometry'][2].twist.covariance[0] < 1  # before the loss it was known
 
 
 def test_diagnostics_say_what_comes_and_goes(graph: Graph, frames: SyntheticSequence) -> None:
-    """Contents and order. How much time passes between two reports is up to the machine, but never less than a period."""
+    """Checks contents and order. The time between two reports depends on the machine, but on average is at least a period."""
     started_s = time.monotonic()
     camera, diagnostics = Camera(graph), Diagnostics(graph)
     done = graph.collect(Header, '/splatam/processed')
@@ -144,7 +144,7 @@ def test_diagnostics_say_what_comes_and_goes(graph: Graph, frames: SyntheticSequ
         'splatam: input', 'splatam: tracking', 'splatam: processing', 'splatam: map'
     ]  # fmt: skip
     assert {status.hardware_id for status in diagnostics.arrays[-1].status} == {CAMERA_FRAME}
-    for topic in topics:  # the delay includes the age of the stamp, and whatever a busy machine adds
+    for topic in topics:  # the age of the stamp, and more on a busy machine
         assert 0.5 <= float(values('input', f'{topic} delay (s)')) < time.monotonic() - started_s + 0.5
         assert values('input', f'{topic} publishers') == '1'
     assert 0.5 < float(values('processing', 'pose delay (s)')) < time.monotonic() - started_s + 0.5
@@ -155,7 +155,7 @@ def test_diagnostics_say_what_comes_and_goes(graph: Graph, frames: SyntheticSequ
     assert int(values('map', 'Gaussians')) > 1000
     assert 50 < float(values('map', 'memory (MB)')) < 4000  # torch alone is above the lower limit
 
-    graph.spin_until(lambda: max(rates()) == 0, explain=explain)  # nothing is sent any more
+    graph.spin_until(lambda: max(rates()) == 0, explain=explain)  # no more images are sent
     counts = [int(values('tracking', f'frames {status.value}')) for status in Status]
     assert sum(counts) == len(done) == next(numbers)
     reported_ns = [stamps.message_stamp_ns(array) for array in diagnostics.arrays]
@@ -212,11 +212,11 @@ def test_the_map_is_there_for_whoever_comes_after_the_last_frame(graph: Graph, f
     assert [stamps.message_stamp_ns(pose) for pose in path.poses] == [still(frames, n).stamp_ns for n in (0, 3)]
     check_cloud(cloud, 100)
     graph.spin_for(2.5)  # more than two periods of both
-    assert len(clouds) == len(paths) == 1  # nothing new, nothing said
+    assert len(clouds) == len(paths) == 1  # nothing new, so nothing is published
 
 
 class Counted(Slam):
-    """How often was it asked for something that costs?"""
+    """Counts the calls of the costly functions."""
 
     renders = snapshots = 0
 
@@ -254,7 +254,7 @@ def test_what_costs_is_made_for_listeners_only_and_at_its_rate(
     numbers = itertools.count()
 
     def publish() -> None:
-        """50 frames a second, and nothing is lost on the way."""
+        """Publish a frame, 20 ms after the last, and wait for its messages."""
         clock.now_s += 0.02
         stamp_ns = result.stamp_ns + 20_000_000 * next(numbers)
         frame = replace(frames[0], stamp_ns=stamp_ns, frame_id=CAMERA_FRAME)
@@ -294,7 +294,7 @@ def test_what_costs_is_made_for_listeners_only_and_at_its_rate(
 
 
 def check_cloud(cloud: PointCloud2, count: int) -> None:
-    """The layout that RViz's RGB8 transformer and Foxglove's ``rgb`` colour mode read, and ours behind it."""
+    """Checks the layout: first the fields for RViz's RGB8 transformer and Foxglove's ``rgb`` colour mode, then ours."""
     assert [(field.name, field.offset, field.datatype, field.count) for field in cloud.fields] == [
         (name, 4 * i, PointField.FLOAT32, 1) for i, name in enumerate(('x', 'y', 'z', 'rgb', 'opacity', 'radius'))
     ]
@@ -305,11 +305,11 @@ def check_cloud(cloud: PointCloud2, count: int) -> None:
     assert ((radius > 1e-4) & (radius < 0.5)).all()  # metres; Gaussians of a room seen by 64x48 pixels
 
 
-# --- the standard recorder: it cannot run here, so this does what it does ---
+# --- recording: the standard recorder is not available, so the test records in the same way ---
 
 
 def recorder_qos(offered: QoSProfile) -> QoSProfile:
-    """As rosbag2 adapts to what is offered: no less, so that nothing is lost, and no more, so that something comes."""
+    """Returns the QoS with which rosbag2 subscribes: exactly what is offered."""
     return QoSProfile(depth=100, reliability=offered.reliability, durability=offered.durability)
 
 
@@ -322,7 +322,7 @@ def recorded_qos(offered: QoSProfile) -> Qos:
 
 
 def test_what_was_recorded_of_the_node_plays_back(graph: Graph, tf_message: type, bag: Path, frames: SyntheticSequence) -> None:
-    """Every output, raw, by the types and QoS that the graph tells; read by another library, and played again."""
+    """Records every output raw, with types and QoS from the graph; reads the bag with another library and plays it."""
     node = run_node(graph, queue_policy='all', exit_on_publisher_end=True, publish_rate__path=0.0,
                     publish_rate__cloud=0.0)  # fmt: skip
     topics = [*TOPICS, '/splatam/processed', '/tf', '/diagnostics']
@@ -359,11 +359,11 @@ def test_what_was_recorded_of_the_node_plays_back(graph: Graph, tf_message: type
     )  # fmt: skip
     graph.spin_until(lambda: all(again.values()), explain=lambda: replay.text)
     assert not replay.says('left out')
-    for topic, messages in again.items():  # latched as recorded: they reach whoever asks for that
+    for topic, messages in again.items():  # latched as recorded, so a late subscriber gets them
         assert messages[0] in heard[topic]
 
 
-# --- viewers: neither can run in a test, but what they need can be checked ---
+# --- viewers: they cannot run in a test, but their configurations can be checked ---
 
 SHOWS = {
     'rviz_default_plugins/PointCloud2': 'sensor_msgs/msg/PointCloud2',

@@ -1,4 +1,4 @@
-"""Parameters: from the user's words to checked options, and back to ROS descriptors."""
+"""Parameters: from user input to checked options, and to ROS descriptors."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_what_is_not_allowed_is_refused(make_node: MakeNode, values: dict[str, A
 
 
 class Changes:
-    """A node whose parameters can change, and what it was told of that."""
+    """A node whose parameters can change; records the calls about changes."""
 
     def __init__(self, node: Node) -> None:
         self.node = node

@@ -1,4 +1,4 @@
-"""The tree of frames against closed forms: motion on a circle, chains, and what is not known."""
+"""The transform buffer compared with closed forms: motion on a circle, chains, and unknown transforms."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from splatam_ros.frames.buffer import KEEP_NS, TransformBuffer, TransformError
 from splatam_ros.frames.rep105 import parse_pose
 
 SECOND = 10**9
-EXACT = 1e-12  # a handful of float64 products of numbers around one
+EXACT = 1e-12  # a few float64 products of numbers around one
 
 
 def on_circle(seconds: float) -> np.ndarray:
-    """A robot that drives a circle of 2 m at half a radian a second: one screw, so interpolation is exact."""
+    """Returns a pose on a circle of 2 m radius at 0.5 rad/s: a screw motion, so interpolation is exact."""
     return se3.exp(np.array([1.0, 0, 0, 0, 0, 0.5]) * seconds)
 
 
@@ -30,7 +30,7 @@ def turned(x: float, yaw: float = 0.0) -> np.ndarray:
 
 @pytest.fixture
 def tree() -> TransformBuffer:
-    """The robot for 10 s at 10 Hz, with a camera a link away."""
+    """Returns 10 s of the robot at 10 Hz, with a camera two static links away."""
     tree = TransformBuffer()
     tree.set_static('base', 'mast', turned(0.1, 0.2))
     tree.set_static('mast', 'camera', turned(0.3, -0.4))
@@ -119,7 +119,7 @@ def test_what_cannot_come_is_not_waited_for(tree: TransformBuffer) -> None:
     with pytest.raises(TransformError):
         tree.lookup('odom', 'lidar', timeout_s=30.0)
     tree.lookup('odom', 'base', 2 * SECOND, timeout_s=30.0)
-    assert time.monotonic() - started_s < 10  # neither of the two waits
+    assert time.monotonic() - started_s < 10  # neither waits
 
 
 def test_poses_as_parameters() -> None:
