@@ -49,8 +49,7 @@ class Remote:
 
 def stays(graph: Graph, count: Callable[[], int]) -> bool:
     """Whether nothing more comes for the time of seven frames, once what was on its way has come."""
-    graph.spin_for(0.2)
-    before = count()
+    before = graph.settled(count)
     graph.spin_for(7 / 30)
     return count() == before
 

@@ -76,6 +76,15 @@ def camera_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def drift_ms(sent_ns: list[int], due_ns: list[int], parts: int) -> float:
+    """How much the smallest lateness differs between parts of a playback.
+
+    A busy machine delays single messages, but some of every part go out in time.
+    """
+    late_ns = np.subtract(sent_ns, due_ns)
+    return np.ptp([part.min() for part in np.array_split(late_ns, parts)]) / 1e6
+
+
 def test_rate_one_keeps_time_and_loses_nothing(graph: Graph, camera_bag: Path) -> None:
     sent_ns: dict[str, list[int]] = {RGB: [], DEPTH: []}
     received: dict[str, list[int]] = {RGB: [], DEPTH: []}
@@ -93,10 +102,11 @@ def test_rate_one_keeps_time_and_loses_nothing(graph: Graph, camera_bag: Path) -
     expected = [10**9 + i * STEP_NS for i in range(60)]
     assert received == {RGB: expected, DEPTH: expected}
     for topic, published_ns in sent_ns.items():
-        offsets_ns = np.subtract(published_ns, expected)  # a constant, if time is kept
-        assert np.percentile(np.abs(offsets_ns - np.median(offsets_ns)), 95) < 20e6, topic
+        assert drift_ms(published_ns, expected, parts=4) < 20, topic
+    offsets_ms = np.subtract(list(sent_ns.values()), expected) / 1e6
     late_ms = float(player.text.split('95 % of all at most ')[1].split()[0])
-    assert 0 < late_ms < 20
+    assert late_ms > 0
+    assert late_ms == pytest.approx(np.percentile(offsets_ms - offsets_ms.min(), 95), abs=20)  # as its subscriber measures it
 
 
 @pytest.mark.parametrize('rate', ['0.5', '2'])
@@ -104,8 +114,8 @@ def test_the_rate_scales_time(graph: Graph, bag: Path, rate: str) -> None:
     sent_ns: list[int] = []
     graph.node.create_subscription(Image, RGB, lambda data, info: sent_ns.append(info['source_timestamp']), ALL_KEPT, raw=True)
     finish(graph, graph.play(str(bag), '--topics', RGB, '--rate', rate))
-    seconds = (sent_ns[-1] - sent_ns[0]) / 1e9
-    assert seconds == pytest.approx(11 / 30 / float(rate), abs=0.05)  # a busy core may delay the last message
+    due_ns = [round(time_ns / float(rate)) for time_ns in stamps(recorded(bag, RGB))]
+    assert drift_ms(sent_ns, due_ns, parts=2) < 50
 
 
 @pytest.mark.parametrize(
