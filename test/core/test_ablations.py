@@ -1,4 +1,4 @@
-"""The paper's ablations: each switches off what it names, and a set goes on where it stopped."""
+"""The paper's ablations: each changes what its name says, and an interrupted set continues where it stopped."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_each_variant_changes_what_it_is_named_after_and_nothing_else() -> None:
 
 
 def in_this_process(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
-    """In place of a process of its own, which takes seconds to import everything anew."""
+    """Replaces a process of its own, which would take seconds to import the libraries again."""
     return subprocess.CompletedProcess(command, main(command[3:]))
 
 

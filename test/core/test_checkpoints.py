@@ -1,4 +1,4 @@
-"""Checkpoints: a run that was broken off ends as if it had not been; what is damaged is refused, nothing executed."""
+"""Checkpoints: a resumed run ends like an uninterrupted one; damaged files are refused, and nothing in them is executed."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SOURCE = ['synthetic:noise=off', '--width', str(WIDTH), '--max-frames', str(FRAM
 PRESETS = ('quick', 'splatam', 'realtime')
 FAST = ['threads=1', 'mapping.iterations=6', 'keyframes.every=2', 'keyframes.window=3']
 ITERATIONS = {'quick': 6, 'splatam': 8, 'realtime': 6}
-MEASURED = {'fps', 'fps_with_io', 'timings_ms', 'finish_s', 'peak_rss_mb', 'peak_gpu_mb'}  # times, and the memory of one process
+MEASURED = {'fps', 'fps_with_io', 'timings_ms', 'finish_s', 'peak_rss_mb', 'peak_gpu_mb'}  # wall times, and memory of the process
 PROGRESS = Progress(FRAMES, 3, '0' * 64, 4)
 
 
@@ -78,7 +78,7 @@ def tree(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope='module')
 def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Runs without checkpoints or interruption, by preset; not to be changed."""
+    """Uninterrupted runs without checkpoints, by preset; tests must not change them."""
     folder = tmp_path_factory.mktemp('whole')
     for preset in PRESETS:
         assert splatam(*arguments(preset, folder / preset)) == 0
@@ -87,7 +87,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope='module')
 def broken_off(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a run leaves that was killed one frame after its second checkpoint; not to be changed."""
+    """The folder of a run that was killed one frame after its second checkpoint; tests must not change it."""
     folder = tmp_path_factory.mktemp('killed') / 'run'
     killed_after(7, arguments('quick', folder, '--checkpoint-every', EVERY))
     return folder
@@ -95,13 +95,13 @@ def broken_off(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(broken_off: Path, tmp_path: Path) -> Path:
-    """The same, to be changed."""
+    """A copy of ``broken_off`` that a test may change."""
     return Path(shutil.copytree(broken_off, tmp_path / 'run'))
 
 
 @pytest.fixture(scope='module')
 def state() -> SlamState:
-    """Of Slam after four frames."""
+    """The state of Slam after four frames."""
     slam, frames = Slam(load_config('quick', settings('quick'))), open_sequence(SOURCE[0], width=WIDTH, max_frames=4)
     for index in range(len(frames)):
         slam.process(frames[index])
@@ -109,7 +109,7 @@ def state() -> SlamState:
 
 
 def killed_after(frames: int, words: list[str]) -> None:
-    """Run the command line in a process that is killed once so many frames are written down."""
+    """Runs the command line in a process that is killed as soon as its folder has this many frames."""
     code = """
         import os, signal, sys
         from splatam_core import cli
@@ -130,7 +130,7 @@ def killed_after(frames: int, words: list[str]) -> None:
     assert process.returncode == -signal.SIGKILL, output
 
 
-# --- going on ---
+# --- resuming ---
 
 
 @pytest.mark.slow
@@ -140,7 +140,7 @@ def test_a_run_that_was_killed_ends_as_if_it_had_not_been(preset: str, whole: di
     assert len((tmp_path / 'run' / 'trajectory.txt').read_text().splitlines()) == 5  # two after the checkpoint
     assert splatam('run', '--resume', tmp_path / 'run', '--no-evaluate') == 0
     assert result(tmp_path / 'run') == result(whole[preset])
-    assert len(read_run(whole[preset]).trajectory) >= FRAMES - 2  # they would agree on lost frames, too
+    assert len(read_run(whole[preset]).trajectory) >= FRAMES - 2  # otherwise they might agree because all frames are lost
     assert len(read_run(tmp_path / 'run').frames) == FRAMES
 
 
@@ -157,7 +157,7 @@ def test_killed_and_resumed_time_and_again(whole: dict[str, Path], tmp_path: Pat
     killed_after(4, arguments('quick', tmp_path / 'run', '--checkpoint-every', 2, '--keep-checkpoints', 1))
     killed_after(7, ['run', '--resume', str(tmp_path / 'run'), '--no-evaluate'])
     folder = tmp_path / 'run' / 'checkpoints'
-    assert [path.name for path in checkpoint_paths(folder)] == ['000006.checkpoint']  # both switches are remembered
+    assert [path.name for path in checkpoint_paths(folder)] == ['000006.checkpoint']  # both arguments are kept by the run
     assert splatam('run', '--resume', tmp_path / 'run', '--no-evaluate') == 0
     assert result(tmp_path / 'run') == result(whole['quick'])
     resumed = json.loads((tmp_path / 'run' / 'run.json').read_text())['resumed']
@@ -187,7 +187,7 @@ def test_ctrl_c_saves_a_checkpoint_of_the_last_frame(
 def test_a_run_from_a_gpu_goes_on_without_one(
     run: Path, whole: dict[str, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Where a run is computed may change; not unasked."""
+    """The device of a run may change, but only on request."""
     monkeypatch.setattr(torch.cuda, 'is_available', lambda: False)
     config = run / 'config.yaml'
     config.write_text(config.read_text().replace('device: auto', 'device: cuda'))
@@ -241,7 +241,7 @@ def test_state_is_read_back_as_it_was(state: SlamState, tmp_path: Path) -> None:
 
 
 def test_state_is_a_copy(state: SlamState) -> None:
-    """What is saved must not change with the frames processed after."""
+    """A saved state must not change with later frames."""
     slam, frames = Slam(state.config), open_sequence(SOURCE[0], width=WIDTH, max_frames=6)
     slam.restore(state)
     before = slam.state()
@@ -285,7 +285,7 @@ def test_only_the_last_ones_are_kept(state: SlamState, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_process_killed_while_saving_leaves_the_checkpoint_before(state: SlamState, tmp_path: Path) -> None:
-    """At every place where it waits for the disk, as the file's bytes are written but it has no name yet."""
+    """Killed at every fsync: the bytes of a file are written then, but the file does not have its name yet."""
     path = Checkpoints(tmp_path, 1).save(state, PROGRESS)
     before = path.read_bytes()
     code = """
@@ -314,7 +314,7 @@ def test_a_process_killed_while_saving_leaves_the_checkpoint_before(state: SlamS
     assert list(tmp_path.rglob('.*')), 'nothing was being written'
     assert path.read_bytes() == before and read_newest(tmp_path).progress == PROGRESS
     Checkpoints(tmp_path, 1).save(state, PROGRESS)
-    assert not list(tmp_path.rglob('.*')), 'what the killed ones left is still there'
+    assert not list(tmp_path.rglob('.*')), 'files of the killed processes are still there'
 
 
 @pytest.mark.slow
@@ -344,7 +344,7 @@ def test_a_process_killed_anywhere_while_saving_leaves_a_checkpoint(state: SlamS
 
 @contextmanager
 def file_size_limit(num_bytes: int) -> Iterator[None]:
-    """Writing a file beyond this fails, as on a full disk."""
+    """Makes writing a larger file fail, as on a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, before[1]))
     try:
@@ -369,7 +369,7 @@ def test_a_disk_that_is_full_does_not_stop_slam(
     said = [line for line in capsys.readouterr().err.splitlines() if 'no checkpoint after frame' in line]
     assert len(said) == FRAMES - 2 and all('File too large; the run continues' in line for line in said)
     assert result(tmp_path / 'run') == result(whole['quick'])
-    assert len(checkpoint_paths(tmp_path / 'run' / 'checkpoints')) == 2  # once there was room
+    assert len(checkpoint_paths(tmp_path / 'run' / 'checkpoints')) == 2  # once they fitted
     assert not list((tmp_path / 'run').rglob('.*'))
 
 
@@ -377,7 +377,7 @@ def test_a_disk_that_is_full_does_not_stop_slam(
 
 
 def refused(run: Path, capsys: pytest.CaptureFixture[str], *more: object) -> str:
-    """The one line that says why a run is not resumed, and changes nothing."""
+    """Returns the one line that says why a run is not resumed; checks that the folder is unchanged."""
     before = tree(run)
     assert splatam('run', '--resume', run, *more) == cli.EXIT_ERROR
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith('splatam: error: ')]
@@ -437,7 +437,7 @@ def test_the_error_shows_a_way_out_that_works(run: Path, whole: dict[str, Path],
 
 
 class Executes:
-    """Makes a file when it is unpickled."""
+    """Creates a file when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -480,7 +480,7 @@ def test_other_files_are_refused(run: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_whole_archives_of_senseless_content_are_refused(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Whoever computes the checksum may write what they like; it must still be a checkpoint."""
+    """The checksum is right, so only the content can be refused."""
     newest = run / 'checkpoints' / '000006.checkpoint'
     content = read_archive(newest, 'checkpoint', 1)
     for values, arrays in (
@@ -555,7 +555,7 @@ def test_other_code_is_said(run: Path, monkeypatch: pytest.MonkeyPatch, capsys: 
 def test_an_archive_is_the_same_whenever_it_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
     content = Content({'a': 1.5}, {'b': np.arange(3)})
     first = pack('checkpoint', 1, content)
-    monkeypatch.setattr(time, 'localtime', lambda *_: time.gmtime(2e9))  # an archive has dates
+    monkeypatch.setattr(time, 'localtime', lambda *_: time.gmtime(2e9))  # an npz file can hold dates
     again = pack('checkpoint', 1, content)
     assert (first.header, bytes(first.payload)) == (again.header, bytes(again.payload))
 

@@ -1,4 +1,4 @@
-"""The command line, as a user meets it: what it writes, what it refuses, how it stops."""
+"""The command line as a user sees it: what it writes, what it refuses, how it stops."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def stamps(folder: Path) -> list[int]:
 
 @pytest.fixture(scope='module')
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of the command line; not to be changed."""
+    """A run of the command line; tests must not change it."""
     folder = tmp_path_factory.mktemp('cli') / 'run'
     assert splatam('run', SOURCE, *SMALL, *SETTINGS, '--out', folder) == 0
     return folder
@@ -67,13 +67,13 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def copy(finished: Path, tmp_path: Path) -> Path:
-    """The same run, to be changed."""
+    """A copy of ``finished`` that a test may change."""
     return Path(shutil.copytree(finished, tmp_path / 'copy'))
 
 
 @pytest.fixture(scope='module')
 def of_the_node(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder a node leaves behind: no source, no decoding times."""
+    """A run folder as the node writes it: no source, no decoding times."""
     config = load_config('quick', FAST)
     path, slam = tmp_path_factory.mktemp('node') / 'run', Slam(config)
     sequence = open_sequence(SOURCE, width=WIDTH, max_frames=FRAMES)
@@ -159,7 +159,7 @@ def test_existing_results_stay_unless_told_otherwise(copy: Path, capsys: pytest.
     assert (copy / 'trajectory.txt').read_bytes() == before
     assert splatam(*again, '--overwrite') == 0
     assert len((copy / 'trajectory.txt').read_text().splitlines()) == 1
-    assert not (copy / 'report.png').exists()  # the old one shows another run
+    assert not (copy / 'report.png').exists()  # the old report showed another run
 
 
 @pytest.mark.parametrize(
@@ -192,7 +192,7 @@ def test_bugs_keep_their_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def write_tum(folder: Path) -> None:
-    """The first frames as a TUM recording without truth."""
+    """Writes the first frames as a TUM recording without ground truth."""
     sequence = open_sequence(SOURCE, width=WIDTH, max_frames=FRAMES)
     (folder / 'rgb').mkdir(parents=True)
     (folder / 'depth').mkdir()
@@ -260,7 +260,7 @@ def test_too_few_frames_for_a_trajectory_error_is_said(tmp_path: Path, capsys: p
 
 @pytest.fixture
 def long_run(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], Path]]:
-    """A run that is in the middle of many frames."""
+    """A run that has processed a few of its many frames."""
     arguments = ['--width', WIDTH, '--max-frames', 500, *SETTINGS, '--out', tmp_path / 'run']
     process = start('run', SOURCE, *arguments)
     trajectory = tmp_path / 'run' / 'trajectory.txt'

@@ -34,7 +34,7 @@ def splatam(*arguments: object) -> int:
 
 @pytest.fixture(scope='module')
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run; not to be changed."""
+    """A run; tests must not change it."""
     folder = tmp_path_factory.mktemp('commands') / 'tiny'
     assert splatam('run', *SOURCE, '--preset', 'quick', *FAST, '--holdout', HOLD_OUT, '--out', folder) == 0
     return folder
@@ -127,7 +127,7 @@ def test_compare_prints_a_table_and_draws(finished: Path, tmp_path: Path, capsys
     assert table[0]['ATE RMSE cm'] == f'{100 * metrics(finished).ate_rmse_m:.3f}'
     assert table[0]['held out: PSNR dB'] == f'{metrics(finished).heldout.psnr_db:.2f}'
     assert table[1]['ATE RMSE cm'] == '\u2013' and table[1]['tracked'] == f'{FRAMES}/{FRAMES}'
-    assert 'MS-SSIM' not in columns  # nobody has it
+    assert 'MS-SSIM' not in columns  # no run has it
     assert cv2.imread(str(tmp_path / 'plot.png')).std() > 20
 
 
@@ -150,7 +150,7 @@ def test_bench_runs_presets_and_compares_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def here(command: list[str], stdout: object, check: bool) -> subprocess.CompletedProcess[str]:
-        """In this process: loading the libraries takes longer than such a run."""
+        """Runs in this process, because importing the libraries takes longer than the run."""
         assert command[:3] == [sys.executable, '-m', 'splatam_core.cli'] and stdout is None and not check
         return subprocess.CompletedProcess(command, main(command[3:]))
 
@@ -199,7 +199,7 @@ def test_render_shows_the_map_from_given_poses(run: RunRecord, tmp_path: Path) -
     film = cv2.VideoCapture(str(out / 'color.mp4'))
     assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 2 and film.get(cv2.CAP_PROP_FPS) == pytest.approx(10)
     _, first = film.read()
-    # Lossy, but the same picture: the video differs from it by far less than from its mirror image.
+    # The video is lossy: it must be far closer to the picture than to its mirror image.
     picture = cv2.imread(str(out / 'color' / '000000.png')).astype(float)
     assert np.abs(first - picture).mean() < 0.3 * np.abs(first[:, ::-1] - picture).mean()
 
@@ -325,7 +325,7 @@ def test_exported_mesh_lies_where_the_map_is_seen(run: RunRecord, tmp_path: Path
 
 
 def test_export_for_the_original_s_programs(run: RunRecord, tmp_path: Path) -> None:
-    """Names, shapes and kinds of poses as its viewers read them; nothing in the file needs pickle."""
+    """Names, shapes and poses are those that the original's viewers read; nothing in the file needs pickle."""
     assert splatam('export', run.path, tmp_path / 'params.npz', '--as', 'splatam') == 0
     params = dict(np.load(tmp_path / 'params.npz', allow_pickle=False))
     gaussians, poses, n = run.read_map(), run.trajectory.T_world_cam, len(run.read_map())

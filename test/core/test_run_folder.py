@@ -1,4 +1,4 @@
-"""Run folders: written line by line, never overwritten by accident, read back whole."""
+"""Run folders: written line by line, never overwritten by accident, and read back completely."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def test_overwrite_removes_a_run_and_nothing_else(tmp_path: Path) -> None:
         folder.append(frame(0), result(0), 0.1)
     (run / 'checkpoints').mkdir()
     (run / 'checkpoints' / '1').touch()
-    (run / '.map.ply.4242').touch()  # of a writer that was killed
+    (run / '.map.ply.4242').touch()  # left by a writer that was killed
     RunFolder.create(run, CONFIG, OFFLINE, overwrite=True).close()
     assert read_run(run).description == OFFLINE and len(read_run(run).trajectory) == 0
     assert not (run / 'checkpoints').exists() and not (run / '.map.ply.4242').exists()
@@ -245,9 +245,9 @@ def test_a_run_begun_anew_keeps_the_one_before(tmp_path: Path) -> None:
     assert (len(before.trajectory), len(now.trajectory)) == (2, 1)
     assert (before.config, now.config) == (CONFIG, other)
     assert before.description == now.description == NODE and now.camera == before.camera
-    written(folder.restarted(CONFIG), 7, 8, 9).close()  # only the last one before is kept
+    written(folder.restarted(CONFIG), 7, 8, 9).close()  # only the last of the previous runs is kept
     assert (len(read_run(tmp_path / 'previous').trajectory), len(read_run(tmp_path).trajectory)) == (1, 3)
-    RunFolder.create(tmp_path, CONFIG, NODE, overwrite=True).close()  # all of it is a run's
+    RunFolder.create(tmp_path, CONFIG, NODE, overwrite=True).close()  # all its files belong to a run
     assert not (tmp_path / 'previous').exists()
 
 
@@ -268,5 +268,5 @@ def test_a_run_does_not_move_where_something_is(tmp_path: Path) -> None:
         folder.moved(tmp_path / 'b')
     with pytest.raises(RunFolderError, match='cannot be written'):
         folder.moved(tmp_path / 'b' / 'thesis.tex' / 'c')
-    written(folder, 1).close()  # and goes on where it is
+    written(folder, 1).close()  # and it continues where it is
     assert len(read_run(tmp_path / 'a').trajectory) == 2
