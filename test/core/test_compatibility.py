@@ -91,6 +91,7 @@ def test_a_run_folder_is_evaluated(name: str, run: Path) -> None:
     assert (run / 'report.html').is_file() and (run / 'report.png').is_file()
 
 
+@pytest.mark.slow
 def test_a_run_folder_is_rendered_exported_compared_and_refined(
     run: Path, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -106,6 +107,7 @@ def test_a_run_folder_is_rendered_exported_compared_and_refined(
     assert read_run(tmp_path / 'refined').config == config_of(name)
 
 
+@pytest.mark.slow
 def test_a_resumed_run_ends_like_an_uninterrupted_one(name: str, run: Path, tmp_path: Path) -> None:
     """Bit for bit where the present code repeats the recorded run bit for bit; on other processors closely."""
     old, whole = read_run(FIXTURES / name), tmp_path / 'whole'
