@@ -41,7 +41,7 @@ CONFIG = load_config('quick', ['threads=1'])
 STEP_NS, COUNT, LOST = 33_333_333, 9, 4
 ORIGINAL = [entry.name for entry in dataclasses.fields(OriginalScores)]
 CAMERA = PinholeCamera(48, 36, 40.0, 40.0, 23.5, 17.5)
-T_TRUTH_WORLD = se3.exp(np.array([3.0, -1.0, 2.0, 0.3, 1.0, -0.5]))
+T_GROUND_TRUTH_WORLD = se3.exp(np.array([3.0, -1.0, 2.0, 0.3, 1.0, -0.5]))
 
 
 @dataclass(frozen=True)
@@ -81,11 +81,11 @@ class Wall:
 
     def ground_truth(self) -> Trajectory:
         stamps = self.first_ns + STEP_NS * np.arange(COUNT)
-        return Trajectory(stamps, np.array([T_TRUTH_WORLD @ self.pose(index) for index in range(COUNT)]))
+        return Trajectory(stamps, np.array([T_GROUND_TRUTH_WORLD @ self.pose(index) for index in range(COUNT)]))
 
 
 def make_run(path: Path, sequence: Wall, with_map: bool = True, program: str = 'splatam run') -> RunRecord:
-    """A run whose poses are the truth's, in another world, and whose map is the wall. One frame is lost."""
+    """Write a run whose poses are the ground truth in another world, and whose map is the wall. One frame is lost."""
     source = None if program == 'splatam_node' else Source('/data/wall', max_frames=COUNT)
     with RunFolder.create(path, CONFIG, RunDescription(program, 'quick', source)) as folder:
         for index in range(COUNT):
@@ -107,8 +107,8 @@ def plain(indices: range) -> range:
 def test_a_perfect_run_scores_perfectly(tmp_path: Path) -> None:
     sequence = Wall()
     run = make_run(tmp_path, sequence)
-    truth, images = score_trajectory(run, sequence.ground_truth()), score_images(run, sequence, 1, plain)
-    metrics = combine(run, truth, images).metrics
+    trajectory, images = score_trajectory(run, sequence.ground_truth()), score_images(run, sequence, 1, plain)
+    metrics = combine(run, trajectory, images).metrics
     assert metrics.ate_rmse_m == pytest.approx(0, abs=1e-8)  # nine decimals in the file
     assert metrics.psnr_db > 55  # 8-bit rounding alone gives 58.9
     assert metrics.depth_l1_m == pytest.approx(0, abs=1e-5)
@@ -163,15 +163,15 @@ def test_samples_go_from_worst_to_best(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ('program', 'with_truth', 'with_images'),
+    ('program', 'with_ground_truth', 'with_images'),
     [('splatam run', True, True), ('splatam run', False, True), ('splatam_node', True, False)],
 )
-def test_report_is_drawn_from_whatever_is_known(tmp_path: Path, program: str, with_truth: bool, with_images: bool) -> None:
+def test_report_is_drawn_with_missing_parts(tmp_path: Path, program: str, with_ground_truth: bool, with_images: bool) -> None:
     sequence = Wall()
     run = make_run(tmp_path, sequence, program=program)
-    truth = score_trajectory(run, sequence.ground_truth()) if with_truth else None
+    trajectory = score_trajectory(run, sequence.ground_truth()) if with_ground_truth else None
     images = score_images(run, sequence, 4, plain) if with_images else None
-    write_report(combine(run, truth, images), tmp_path / 'report.png')
+    write_report(combine(run, trajectory, images), tmp_path / 'report.png')
     picture = cv2.imread(str(tmp_path / 'report.png'))
     assert picture.shape[1] == round(WIDTH_IN * DPI)
     assert picture.std() > 20  # something is drawn
@@ -204,7 +204,7 @@ def test_held_out_frames_are_scored_apart_whatever_every_says(tmp_path: Path) ->
 
 @dataclass(frozen=True)
 class Aside(Wall):
-    """A test split of the wall: from 10 cm beside the way, and from view 6 on turned round."""
+    """A test split of the wall: 10 cm beside the path, and turned round from view 6 on."""
 
     name: str = 'wall_test'
 
@@ -219,8 +219,8 @@ class Aside(Wall):
 
 @pytest.mark.parametrize('alignment', ['trajectory', 'first'])
 def test_novel_views_are_rendered_at_true_poses_and_holes_apart(tmp_path: Path, alignment: str) -> None:
-    run, truth = make_run(tmp_path, Wall()), Wall().ground_truth()
-    novel = score_novel_views(run, truth, Aside(), alignment, plain)
+    run = make_run(tmp_path, Wall())
+    novel = score_novel_views(run, Wall().ground_truth(), Aside(), alignment, plain)
     metrics = combine(run, None, None, novel).metrics
     assert (metrics.novel_frames, metrics.novel_holes_frames, metrics.novel_alignment) == (6, 3, alignment)
     assert metrics.novel.psnr_db > 50  # 8 bits; alignment leaves the file's nine decimals
@@ -306,14 +306,14 @@ def check_page(text: str) -> Page:
     return page
 
 
-@pytest.mark.parametrize(('with_truth', 'with_images'), [(True, True), (False, True), (True, False), (False, False)])
-def test_page_is_complete_and_needs_nothing_else(tmp_path: Path, with_truth: bool, with_images: bool) -> None:
+@pytest.mark.parametrize(('with_ground_truth', 'with_images'), [(True, True), (False, True), (True, False), (False, False)])
+def test_page_is_complete_and_needs_nothing_else(tmp_path: Path, with_ground_truth: bool, with_images: bool) -> None:
     sequence = Wall()
     run = make_run(tmp_path / 'a run & <more>', sequence)
-    truth = score_trajectory(run, sequence.ground_truth()) if with_truth else None
+    trajectory = score_trajectory(run, sequence.ground_truth()) if with_ground_truth else None
     images = score_images(run, sequence, 4, plain) if with_images else None
-    novel = score_novel_views(run, sequence.ground_truth(), Aside(), 'first', plain) if with_truth and with_images else None
-    page = check_page(html_report(combine(run, truth, images, novel)))
+    novel = score_novel_views(run, sequence.ground_truth(), Aside(), 'first', plain) if with_ground_truth and with_images else None
+    page = check_page(html_report(combine(run, trajectory, images, novel)))
     assert 'a run & <more>' in page.text and f'of {COUNT}' in page.text and 'more' not in page.tags
     assert ('ATE RMSE' in page.text) and ('tracking.iterations' in page.text)
     assert page.tags.count('figure') == 7 * (len(images.samples) if images else 0) + 7 * (len(novel.samples) if novel else 0)
@@ -334,9 +334,9 @@ def test_page_of_hardly_a_run(tmp_path: Path, frames: int) -> None:
 def test_the_table_of_frames_is_what_the_means_are_of(tmp_path: Path) -> None:
     sequence = Wall()
     run = make_run(tmp_path, sequence)
-    truth, images = score_trajectory(run, sequence.ground_truth()), score_images(run, sequence, 1, plain)
+    trajectory, images = score_trajectory(run, sequence.ground_truth()), score_images(run, sequence, 1, plain)
     novel = NovelViews('first', images.frames[:2], images.frames[2:3], ())
-    evaluation = combine(run, truth, images, novel)
+    evaluation = combine(run, trajectory, images, novel)
     write_frame_table(evaluation, tmp_path / 'scores.csv')
     rows = list(csv.DictReader((tmp_path / 'scores.csv').open()))
     assert [row['kind'] for row in rows] == ['frame'] * (COUNT - 1) + ['novel'] * 3

@@ -40,10 +40,10 @@ def moved(trajectory: Trajectory, offsets: np.ndarray) -> Trajectory:
 
 
 def square(centre_noise: np.ndarray) -> tuple[Trajectory, Trajectory]:
-    """Truth at the corners of a square of side 2 about the origin, and an estimate that is off by the noise."""
+    """Ground truth at the corners of a square of side 2 about the origin, and an estimate that is off by the noise."""
     corners = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]], dtype=float)
-    truth = Trajectory(EPOCH_NS + STEP_NS * np.arange(4), se3.compose(np.tile([1.0, 0, 0, 0], (4, 1)), corners))
-    return moved(truth, centre_noise), truth
+    ground_truth = Trajectory(EPOCH_NS + STEP_NS * np.arange(4), se3.compose(np.tile([1.0, 0, 0, 0], (4, 1)), corners))
+    return moved(ground_truth, centre_noise), ground_truth
 
 
 def test_known_noise_gives_the_error_by_hand() -> None:
@@ -53,40 +53,40 @@ def test_known_noise_gives_the_error_by_hand() -> None:
 
 
 def test_scale_is_not_aligned_away() -> None:
-    estimate, truth = square(np.zeros((4, 3)))
-    grown = moved(truth, 0.1 * truth.T_world_cam[:, :3, 3])
+    estimate, ground_truth = square(np.zeros((4, 3)))
+    grown = moved(ground_truth, 0.1 * ground_truth.T_world_cam[:, :3, 3])
     # Each corner lies sqrt(2) from the centre, and a tenth of that too far out.
-    assert trajectory_error(grown, truth).rmse_m == pytest.approx(0.1 * np.sqrt(2), abs=ROUND_OFF_M)
-    assert trajectory_error(estimate, truth).rmse_m == pytest.approx(0, abs=ROUND_OFF_M)
+    assert trajectory_error(grown, ground_truth).rmse_m == pytest.approx(0.1 * np.sqrt(2), abs=ROUND_OFF_M)
+    assert trajectory_error(estimate, ground_truth).rmse_m == pytest.approx(0, abs=ROUND_OFF_M)
 
 
 def test_a_mirror_image_is_not_aligned_away() -> None:
-    truth = wandering(50)
-    mirrored = Trajectory(truth.stamps_ns, truth.T_world_cam.copy())
+    ground_truth = wandering(50)
+    mirrored = Trajectory(ground_truth.stamps_ns, ground_truth.T_world_cam.copy())
     mirrored.T_world_cam[:, 0, 3] *= -1
-    T = trajectory_error(mirrored, truth).T_estimate_ground_truth
+    T = trajectory_error(mirrored, ground_truth).T_estimate_ground_truth
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
-    assert trajectory_error(mirrored, truth).rmse_m > 0.01
+    assert trajectory_error(mirrored, ground_truth).rmse_m > 0.01
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_where_the_truth_has_its_world_changes_nothing(seed: int) -> None:
+def test_the_world_of_the_ground_truth_changes_nothing(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    truth = wandering(80)
-    estimate = moved(truth, rng.normal(0, 0.02, (80, 3)))
+    ground_truth = wandering(80)
+    estimate = moved(ground_truth, rng.normal(0, 0.02, (80, 3)))
     T = se3.exp(rng.normal(0, 2, 6))
-    here, there = trajectory_error(estimate, truth), trajectory_error(estimate, transformed(truth, T))
+    here, there = trajectory_error(estimate, ground_truth), trajectory_error(estimate, transformed(ground_truth, T))
     assert there.rmse_m == pytest.approx(here.rmse_m, abs=ROUND_OFF_M)
     np.testing.assert_allclose(there.ground_truth_m, here.ground_truth_m, atol=1e-10)  # cancels T and its inverse
 
 
 def test_independent_noise_shows_in_full() -> None:
-    truth, sigma, count = wandering(2000), 0.02, 2000
+    ground_truth, sigma, count = wandering(2000), 0.02, 2000
     noise = np.random.default_rng(1).normal(0, sigma, (count, 3))
     # 3 N noisy numbers less the 6 a rigid motion fits. The sum of their squares strays by sqrt(2 / 3 N) = 1.8 %,
     # its root by half of that: 3 % is over three sigma.
     expected = sigma * np.sqrt(3 * (1 - 6 / (3 * count)))
-    assert trajectory_error(moved(truth, noise), truth).rmse_m == pytest.approx(expected, rel=0.03)
+    assert trajectory_error(moved(ground_truth, noise), ground_truth).rmse_m == pytest.approx(expected, rel=0.03)
 
 
 def test_alignment_finds_the_motion() -> None:
@@ -106,43 +106,43 @@ def test_alignment_is_the_least_squares_one() -> None:
     assert all(cost(se3.exp(rng.normal(0, 0.01, 6)) @ best) > cost(best) for _ in range(50))
 
 
-def test_truth_is_interpolated_at_the_stamp_of_the_frame() -> None:
+def test_ground_truth_is_interpolated_at_the_stamp_of_the_frame() -> None:
     ends = se3.compose(np.tile([1.0, 0, 0, 0], (2, 1)), np.array([[0.0, 0, 0], [4.0, -8.0, 2.0]]))
-    truth = Trajectory(EPOCH_NS + np.array([0, 40_000_000]), ends)
-    centres, known = interpolate_centres(truth, EPOCH_NS + np.array([0, 10_000_000, 40_000_000]))
+    ground_truth = Trajectory(EPOCH_NS + np.array([0, 40_000_000]), ends)
+    centres, known = interpolate_centres(ground_truth, EPOCH_NS + np.array([0, 10_000_000, 40_000_000]))
     assert known.all()
     np.testing.assert_allclose(centres, [[0, 0, 0], [1, -2, 0.5], [4, -8, 2]], atol=ROUND_OFF_M)
 
 
-def test_frames_without_a_truth_are_not_scored() -> None:
-    truth = wandering(100)
+def test_frames_without_ground_truth_are_not_scored() -> None:
+    ground_truth = wandering(100)
     keep = np.r_[10:40, 60:90]
-    partial = Trajectory(truth.stamps_ns[keep], truth.T_world_cam[keep])
-    assert truth.stamps_ns[60] - truth.stamps_ns[39] > MAX_TRUTH_GAP_NS
-    wild = moved(truth, np.where(np.isin(np.arange(100), keep), 0.0, 50.0)[:, None])
+    partial = Trajectory(ground_truth.stamps_ns[keep], ground_truth.T_world_cam[keep])
+    assert ground_truth.stamps_ns[60] - ground_truth.stamps_ns[39] > MAX_TRUTH_GAP_NS
+    wild = moved(ground_truth, np.where(np.isin(np.arange(100), keep), 0.0, 50.0)[:, None])
     error = trajectory_error(wild, partial)
     np.testing.assert_array_equal(error.stamps_ns, partial.stamps_ns)
     assert error.rmse_m == pytest.approx(0, abs=ROUND_OFF_M)
 
 
 def test_rounded_stamps_at_the_ends_still_count() -> None:
-    truth = wandering(5)
-    just_outside = np.array([truth.stamps_ns[0] - STAMP_ROUNDING_NS, truth.stamps_ns[-1] + STAMP_ROUNDING_NS])
+    ground_truth = wandering(5)
+    just_outside = np.array([ground_truth.stamps_ns[0] - STAMP_ROUNDING_NS, ground_truth.stamps_ns[-1] + STAMP_ROUNDING_NS])
     too_far = just_outside + np.array([-1, 1])
-    assert interpolate_centres(truth, just_outside)[1].all()
-    assert not interpolate_centres(truth, too_far)[1].any()
+    assert interpolate_centres(ground_truth, just_outside)[1].all()
+    assert not interpolate_centres(ground_truth, too_far)[1].any()
 
 
 def test_other_clock_is_an_error_that_names_both_spans() -> None:
-    truth = wandering(10)
-    later = Trajectory(truth.stamps_ns + 10**12, truth.T_world_cam)
+    ground_truth = wandering(10)
+    later = Trajectory(ground_truth.stamps_ns + 10**12, ground_truth.T_world_cam)
     with pytest.raises(RunFolderError, match=r'0 of 10 .* 1700001000\.1\d+ .* 1700000000\.1\d+'):
-        trajectory_error(later, truth)
+        trajectory_error(later, ground_truth)
     with pytest.raises(RunFolderError, match='2 of 2'):
-        trajectory_error(Trajectory(truth.stamps_ns[:2], truth.T_world_cam[:2]), truth)
+        trajectory_error(Trajectory(ground_truth.stamps_ns[:2], ground_truth.T_world_cam[:2]), ground_truth)
     nothing = Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
     with pytest.raises(RunFolderError, match='the ground truth nothing'):
-        trajectory_error(truth, nothing)
+        trajectory_error(ground_truth, nothing)
 
 
 # --- relative pose errors ---
@@ -167,47 +167,47 @@ def test_relative_errors_of_a_drift_by_hand() -> None:
     assert per_second.rotation_rmse_deg == pytest.approx(3.0, abs=1e-6)
 
 
-def test_relative_errors_do_not_see_which_world_the_truth_is_in() -> None:
-    truth = wandering(40)
-    elsewhere = transformed(truth, se3.exp(np.array([3.0, -2, 1, 0.5, 1, -2])))
-    for error in relative_pose_errors(truth, elsewhere):
+def test_relative_errors_do_not_depend_on_the_world_of_the_ground_truth() -> None:
+    ground_truth = wandering(40)
+    elsewhere = transformed(ground_truth, se3.exp(np.array([3.0, -2, 1, 0.5, 1, -2])))
+    for error in relative_pose_errors(ground_truth, elsewhere):
         assert error.translation_rmse_m == pytest.approx(0, abs=1e-10)
         assert error.rotation_rmse_deg == pytest.approx(0, abs=1e-4)
 
 
 def test_one_jump_is_one_wrong_step() -> None:
-    truth = wandering(50)
-    jumped = moved(truth, np.where(np.arange(50)[:, None] >= 20, [0.1, 0, 0], 0.0))
-    per_frame, _ = relative_pose_errors(jumped, truth)
+    ground_truth = wandering(50)
+    jumped = moved(ground_truth, np.where(np.arange(50)[:, None] >= 20, [0.1, 0, 0], 0.0))
+    per_frame, _ = relative_pose_errors(jumped, ground_truth)
     assert per_frame.translation_rmse_m == pytest.approx(0.1 / np.sqrt(49), abs=ROUND_OFF_M)
 
 
 def test_no_step_is_taken_over_lost_frames() -> None:
-    truth = wandering(50)
+    ground_truth = wandering(50)
     tracked = np.arange(50) != 25
-    estimate = Trajectory(truth.stamps_ns[tracked], truth.T_world_cam[tracked])
-    assert relative_pose_errors(estimate, truth)[0].pairs == 48  # 24 to 26 is the next tracked frame
-    assert relative_pose_errors(estimate, truth, [int(truth.stamps_ns[25])])[0].pairs == 47
+    estimate = Trajectory(ground_truth.stamps_ns[tracked], ground_truth.T_world_cam[tracked])
+    assert relative_pose_errors(estimate, ground_truth)[0].pairs == 48  # 24 to 26 is the next tracked frame
+    assert relative_pose_errors(estimate, ground_truth, [int(ground_truth.stamps_ns[25])])[0].pairs == 47
 
 
 def test_without_a_frame_a_second_later_there_is_no_such_error() -> None:
-    truth = wandering(20)
-    per_frame, per_second = relative_pose_errors(truth, truth)
+    ground_truth = wandering(20)
+    per_frame, per_second = relative_pose_errors(ground_truth, ground_truth)
     assert per_frame.pairs == 19
     assert per_second == RelativePoseError(None, None, 0)
     nothing = Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
-    assert relative_pose_errors(nothing, truth) == (RelativePoseError(None, None, 0),) * 2
+    assert relative_pose_errors(nothing, ground_truth) == (RelativePoseError(None, None, 0),) * 2
 
 
 def test_poses_between_two_true_ones() -> None:
     turned = se3.exp(np.array([1.0, 0, 0, 0, 0, np.pi / 2]))
     turned[:3, 3] = [1.0, 0, 0]
-    truth = Trajectory(np.array([0, 400_000_000]), np.array([np.eye(4), turned]))
-    poses, known = interpolate_poses(truth, np.array([0, 100_000_000, 400_000_000, 900_000_000]))
+    ground_truth = Trajectory(np.array([0, 400_000_000]), np.array([np.eye(4), turned]))
+    poses, known = interpolate_poses(ground_truth, np.array([0, 100_000_000, 400_000_000, 900_000_000]))
     assert known.tolist() == [True, True, True, False]
     assert poses[1, :3, 3] == pytest.approx([0.25, 0, 0])
     assert se3.rotation_vector(poses[1, :3, :3]) == pytest.approx([0, 0, np.pi / 8])
-    assert np.allclose(poses[[0, 2]], truth.T_world_cam, atol=ROUND_OFF_M)
+    assert np.allclose(poses[[0, 2]], ground_truth.T_world_cam, atol=ROUND_OFF_M)
 
 
 # --- what the original computes ---
@@ -216,29 +216,29 @@ def test_poses_between_two_true_ones() -> None:
 def test_the_original_s_ate_is_a_mean_of_world_to_camera_translations() -> None:
     """Cameras that do not turn have -c there: then it is the mean distance of the centres, aligned."""
     noise = np.array([[0, 0, 0.04], [0, 0, -0.04], [0, 0, 0.04], [0, 0, -0.04]])
-    estimate, truth = square(noise)
-    assert splatam_ate_mean_m(estimate, truth) == pytest.approx(0.04, abs=1e-3)  # the first pose's own error tilts nothing
+    estimate, ground_truth = square(noise)
+    assert splatam_ate_mean_m(estimate, ground_truth) == pytest.approx(0.04, abs=1e-3)  # the first pose's own error tilts nothing
 
 
 def test_the_original_s_ate_sees_a_turn_with_the_distance_from_the_origin() -> None:
     """Ten metres out, half a degree of wrong rotation in every second pose: no centre is off, the original's is by cm."""
-    truth = at_30_hz([se3.compose(np.array([1.0, 0, 0, 0]), np.array([1.0 * i, i % 3, i % 2])) for i in range(11)])
-    T = truth.T_world_cam.copy()
+    ground_truth = at_30_hz([se3.compose(np.array([1.0, 0, 0, 0]), np.array([1.0 * i, i % 3, i % 2])) for i in range(11)])
+    T = ground_truth.T_world_cam.copy()
     T[1::2, :3, :3] = se3.exp(np.array([0, 0, 0, 0, np.radians(0.5), 0]))[:3, :3]
-    turned = Trajectory(truth.stamps_ns, T)
-    assert trajectory_error(turned, truth).rmse_m == pytest.approx(0, abs=ROUND_OFF_M)
-    assert splatam_ate_mean_m(turned, truth) > 0.01
+    turned = Trajectory(ground_truth.stamps_ns, T)
+    assert trajectory_error(turned, ground_truth).rmse_m == pytest.approx(0, abs=ROUND_OFF_M)
+    assert splatam_ate_mean_m(turned, ground_truth) > 0.01
 
 
 def test_poses_are_aligned_where_centres_leave_it_open() -> None:
     """Along a line the centres do not tell how the world is turned about it; the cameras' rotations do."""
-    truth = at_30_hz([se3.exp(np.array([0.1 * i, 0, 0, 0, 0, 0])) for i in range(5)])
+    ground_truth = at_30_hz([se3.exp(np.array([0.1 * i, 0, 0, 0, 0, 0])) for i in range(5)])
     T = se3.exp(np.array([1.0, 2, 3, 0.4, -0.5, 0.6]))
-    assert np.allclose(align_poses(truth.T_world_cam, transformed(truth, T).T_world_cam), T, atol=ROUND_OFF_M)
-    assert np.allclose(align_poses(truth.T_world_cam[:1], transformed(truth, T).T_world_cam[:1]), T, atol=ROUND_OFF_M)
+    assert np.allclose(align_poses(ground_truth.T_world_cam, transformed(ground_truth, T).T_world_cam), T, atol=ROUND_OFF_M)
+    assert np.allclose(align_poses(ground_truth.T_world_cam[:1], transformed(ground_truth, T).T_world_cam[:1]), T, atol=ROUND_OFF_M)
 
 
 def test_aligned_poses_share_the_error() -> None:
-    truth = wandering(4)
+    ground_truth = wandering(4)
     off = np.array([[0.03, 0, 0], [-0.03, 0, 0], [0, 0.03, 0], [0, -0.03, 0]])  # cancels out
-    assert np.allclose(align_poses(truth.T_world_cam, moved(truth, off).T_world_cam), np.eye(4), atol=ROUND_OFF_M)
+    assert np.allclose(align_poses(ground_truth.T_world_cam, moved(ground_truth, off).T_world_cam), np.eye(4), atol=ROUND_OFF_M)

@@ -35,8 +35,8 @@ class Description:
         return value if isinstance(value, str) else f'{value * self.factor:{self.form}}'
 
 
-def _image_scores(prefix: str, of: str) -> tuple[Description, ...]:
-    return (
+def _image_scores(prefix: str, of: str) -> list[Description]:
+    return [
         Description(f'{prefix}psnr_db', 'PSNR', 'dB', 1, '.2f', f'Colour, {of}, over the pixels with a depth reading.'),
         Description(f'{prefix}psnr_full_db', 'PSNR, whole image', 'dB', 1, '.2f', f'Colour, {of}, holes included.'),
         Description(
@@ -53,11 +53,11 @@ def _image_scores(prefix: str, of: str) -> tuple[Description, ...]:
             f'{prefix}depth_rmse_m', 'depth RMSE', 'cm', 100, '.2f',
             'Root mean squared difference of the depth to the readings.',
         ),
-    )  # fmt: skip
+    ]  # fmt: skip
 
 
-def _original_scores(prefix: str) -> tuple[Description, ...]:
-    return (
+def _original_scores(prefix: str) -> list[Description]:
+    return [
         Description(
             f'{prefix}psnr_db', 'PSNR, masked', 'dB', 1, '.2f',
             'Pixels without a depth reading are black in both images and count as perfect.',
@@ -68,7 +68,7 @@ def _original_scores(prefix: str) -> tuple[Description, ...]:
             f'{prefix}depth_l1_m', 'depth L1, unnormalised', 'cm', 100, '.2f',
             'Of the blended depth, not divided by the silhouette; the original also prints it as "Depth RMSE".',
         ),
-    )  # fmt: skip
+    ]  # fmt: skip
 
 
 DESCRIPTIONS: dict[str, tuple[Description, ...]] = {
