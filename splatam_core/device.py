@@ -1,4 +1,4 @@
-"""Where SLAM is computed: on the processor or on a GPU, and by which rasterizer."""
+"""Chooses the device (CPU or GPU) and the rasterizer of a configuration."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from splatam_core.config import SlamConfig
 from splatam_core.errors import ConfigError
 
 INTERPRET = 'TRITON_INTERPRET'
-"""Set to 1 before Python starts, Triton's kernels are interpreted on the processor: for tests, far too slow for else."""
+"""With this environment variable set to 1 before Python starts, Triton interprets its kernels on the CPU; for tests only."""
 
 HOST = torch.device('cpu')
 _INSTALL = "install torch's CUDA build (README, 'On a GPU')"
@@ -23,12 +23,12 @@ _INSTALL = "install torch's CUDA build (README, 'On a GPU')"
 
 @dataclass(frozen=True, slots=True)
 class Backend:
-    """What was chosen.
+    """The device and rasterizer of a configuration.
 
     Attributes:
-        device: where maps live.
-        rasterizer: which one draws them: ``cpu``, ``triton`` or ``reference``.
-        why: the device was chosen; empty where it was asked for.
+        device: the device of maps.
+        rasterizer: ``cpu``, ``triton`` or ``reference``.
+        why: why the device was chosen; empty if the configuration names it.
     """
 
     device: torch.device
@@ -36,15 +36,15 @@ class Backend:
     why: str = ''
 
     def __str__(self) -> str:
-        chosen = f'device = auto: {self.device}, for {self.why}' if self.why else f'device = {self.device}'
+        chosen = f'device = auto: {self.device} ({self.why})' if self.why else f'device = {self.device}'
         return f'{chosen}; rasterizer: {self.rasterizer}'
 
 
 def choose_backend(config: SlamConfig) -> Backend:
-    """Device and rasterizer that a configuration means on this machine.
+    """Returns the device and rasterizer of a configuration on this machine.
 
     Raises:
-        ConfigError: it asks for what is not there.
+        ConfigError: the device or rasterizer is not available.
     """
     device, why = _device(config)
     rasterizer = {'cpu': 'cpu', 'cuda': 'triton'}[device] if config.rasterizer == 'auto' else config.rasterizer
@@ -55,12 +55,12 @@ def choose_backend(config: SlamConfig) -> Backend:
 
 
 def pose_tensor(T: NDArray[np.float64], device: torch.device) -> Tensor:
-    """A pose [4, 4] as rasterizers take it: float32, on the device; the host does not wait for it to arrive."""
+    """Returns a pose [4, 4] as rasterizers take it: float32, on the device. The host does not wait for the transfer."""
     return torch.from_numpy(T).float().to(device, non_blocking=True)
 
 
 def synchronize(device: torch.device) -> None:
-    """Wait until everything that was handed to a device is done; the processor is never behind."""
+    """Waits until a device has finished its work; returns at once for the CPU."""
     if device.type == 'cuda':
         torch.cuda.synchronize(device)
 
@@ -74,7 +74,7 @@ def _device(config: SlamConfig) -> tuple[str, str]:
             raise ConfigError(f'device = cuda: {no_gpu}; {_INSTALL} and the GPU driver, or set device=cpu')
         return 'cuda', ''
     if config.rasterizer == 'cpu':
-        return 'cpu', 'rasterizer = cpu runs there'
+        return 'cpu', 'rasterizer = cpu runs on it'
     if config.rasterizer == 'triton' and _is_interpreted():
         return 'cpu', f'{INTERPRET} is 1'
     if no_gpu:
@@ -91,7 +91,7 @@ def _check_triton(config: SlamConfig, device: str, why: str) -> None:
         reason = why or 'device = cpu'
         raise ConfigError(
             f'rasterizer = triton: needs a GPU, and {reason}; set rasterizer=auto, or set {INTERPRET}=1 in the environment to '
-            'have its kernels interpreted, which is for tests and very slow'
+            'interpret its kernels, which is for tests and very slow'
         )
 
 
@@ -105,7 +105,7 @@ def _why_no_gpu() -> str:
 
 def _why_no_triton(config: SlamConfig) -> str:
     if config.mapping.anisotropic:
-        return 'it draws no anisotropic Gaussians (mapping.anisotropic)'
+        return 'it does not draw anisotropic Gaussians (mapping.anisotropic)'
     return '' if importlib.util.find_spec('triton') else "triton is not installed, which comes with torch's CUDA builds"
 
 

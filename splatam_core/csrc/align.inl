@@ -1,7 +1,7 @@
-// Direct alignment: each point of a reference picture, moved and projected into a frame, should find its own brightness
-// and depth there. Included after lanes.inl.
+// Direct alignment: each point of a reference image is moved and projected into a frame. Its brightness and depth are
+// compared with those of the frame there. Included after lanes.inl.
 
-// rows[i] lane k becomes rows[k] lane i.
+// Transposes in place: lane k of rows[i] becomes lane i of rows[k].
 static inline void transpose(Lanes* rows) {
   Lanes a[8], b[8];
   for (int i = 0; i < 8; i += 2) {
@@ -42,7 +42,7 @@ static inline void tally(std::uint32_t* bins, Lanes residuals, IntLanes seen) {
 // Student's t with five degrees of freedom, as in Kerl et al. 2013.
 static inline Lanes robust_weight(Lanes squared) { return 6.0f / (5.0f + squared); }
 
-// What the frame shows at eight positions: eight lanes each of its layers.
+// Samples the layers of the frame bilinearly at eight positions: sampled[k] holds layer k, one lane per position.
 static inline void sample(const float* layers, int width, Lanes u, Lanes v, IntLanes inside, Lanes* sampled) {
   const IntLanes column = __builtin_convertvector(keep(inside, u), IntLanes);
   const IntLanes row = __builtin_convertvector(keep(inside, v), IntLanes);
@@ -61,14 +61,16 @@ static inline void sample(const float* layers, int width, Lanes u, Lanes v, IntL
   transpose(sampled);
 }
 
-// [6] change of an image's value under points, by a twist of the points in front of the camera.
-static inline void slopes_by_twist(Lanes a, Lanes b, Lanes x, Lanes y, Lanes z, Lanes inverse_z, Lanes* slopes) {
+// Writes the derivatives [6] of an image value at the projected points by a twist that moves the points. (a, b) is the
+// image gradient times focal length over z.
+static inline void gradients_by_twist(Lanes a, Lanes b, Lanes x, Lanes y, Lanes z, Lanes inverse_z,
+                                      Lanes* derivatives) {
   const Lanes c = -(a * x + b * y) * inverse_z;
-  slopes[0] = a, slopes[1] = b, slopes[2] = c;
-  slopes[3] = c * y - b * z, slopes[4] = a * z - c * x, slopes[5] = b * x - a * y;
+  derivatives[0] = a, derivatives[1] = b, derivatives[2] = c;
+  derivatives[3] = c * y - b * z, derivatives[4] = a * z - c * x, derivatives[5] = b * x - a * y;
 }
 
-// Eight points of the reference where the frame would show them.
+// Eight points of the reference, moved into the frame's camera and projected.
 struct Moved {
   Lanes x, y, z, inverse_z, u, v;
   IntLanes inside;
@@ -88,77 +90,81 @@ static inline Moved moved(const Pose& motion, Lanes px, Lanes py, Lanes pz, IntL
 }
 
 static void align(const float* brightness, const float* depth, const Camera& camera, int begin, int end,
-                  const float* layers, const Pose& light_motion, const Pose& depth_motion,
+                  const float* layers, const Pose& color_motion, const Pose& depth_motion,
                   const AlignmentSettings& settings, AlignmentSums& sums, ResidualHistogram& histogram) {
   const Lanes nan = splat(__builtin_nanf(""));
-  const bool is_split = __builtin_memcmp(&light_motion, &depth_motion, sizeof(Pose)) != 0;
+  const bool is_split = __builtin_memcmp(&color_motion, &depth_motion, sizeof(Pose)) != 0;
   for (int row = begin; row < end; ++row) {
     Lanes H[kUnknowns * (kUnknowns + 1) / 2] = {}, g[kUnknowns] = {}, cost{};
     const float ray_y = (row - camera.cy) / camera.fy;
     for (int first = 0; first < camera.width; first += 8) {
       const int columns = camera.width - first < 8 ? camera.width - first : 8;
       const std::size_t at = std::size_t(row) * camera.width + first;
-      Lanes light = nan, range = nan;
-      __builtin_memcpy(&light, brightness + at, sizeof(float) * columns);
+      Lanes intensity = nan, range = nan;
+      __builtin_memcpy(&intensity, brightness + at, sizeof(float) * columns);
       __builtin_memcpy(&range, depth + at, sizeof(float) * columns);
-      const IntLanes known = range > 0.0f;  // NaN is not
+      const IntLanes known = range > 0.0f;  // false for NaN
       const int points = count(known);
       if (points == 0) continue;
       sums.points += points;
       const Lanes px = (iota() + (float(first) - camera.cx)) / camera.fx * range, py = ray_y * range;
-      const Moved d = moved(depth_motion, px, py, range, known, camera);
+      const Moved depth_point = moved(depth_motion, px, py, range, known, camera);
       Lanes frame[kLayers];
-      sample(layers, camera.width, d.u, d.v, d.inside, frame);
-      Lanes depth_residual = (frame[3] - d.z) * d.inverse_z;
-      sums.compared += count(d.inside & (frame[3] == frame[3]));
-      IntLanes seen = d.inside & (absolute(depth_residual) < settings.max_depth_ratio);  // NaN is not
-      Lanes by_light[kUnknowns], by_depth[6];
-      const Lanes tilt_x = frame[4] * camera.fx * d.inverse_z, tilt_y = frame[5] * camera.fy * d.inverse_z;
-      const Lanes upright = 1.0f / sqrt(1.0f + tilt_x * tilt_x + tilt_y * tilt_y);
-      slopes_by_twist(tilt_x, tilt_y, d.x, d.y, d.z, d.inverse_z, by_depth);
+      sample(layers, camera.width, depth_point.u, depth_point.v, depth_point.inside, frame);
+      Lanes depth_residual = (frame[3] - depth_point.z) * depth_point.inverse_z;
+      sums.compared += count(depth_point.inside & (frame[3] == frame[3]));
+      IntLanes seen = depth_point.inside & (absolute(depth_residual) < settings.max_depth_ratio);  // false for NaN
+      Lanes by_photometric[kUnknowns], by_depth[6];
+      const Lanes tilt_x = frame[4] * camera.fx * depth_point.inverse_z,
+                  tilt_y = frame[5] * camera.fy * depth_point.inverse_z;
+      // Cosine between ray and surface normal: turns the depth difference along the ray into a distance from the
+      // surface.
+      const Lanes incidence_cosine = 1.0f / sqrt(1.0f + tilt_x * tilt_x + tilt_y * tilt_y);
+      gradients_by_twist(tilt_x, tilt_y, depth_point.x, depth_point.y, depth_point.z, depth_point.inverse_z, by_depth);
       by_depth[2] -= 1.0f;
-      by_depth[3] -= d.y;
-      by_depth[4] += d.x;
-      const Moved l = is_split ? moved(light_motion, px, py, range, known, camera) : d;
+      by_depth[3] -= depth_point.y;
+      by_depth[4] += depth_point.x;
+      const Moved color_point = is_split ? moved(color_motion, px, py, range, known, camera) : depth_point;
       if (is_split) {
-        seen &= l.inside;
-        sample(layers, camera.width, l.u, l.v, seen, frame);
+        seen &= color_point.inside;
+        sample(layers, camera.width, color_point.u, color_point.v, seen, frame);
       }
       sums.seen += count(seen);
-      Lanes light_residual = keep(seen, frame[0] - (settings.gain * light + settings.bias));
-      depth_residual = keep(seen, depth_residual * upright);
-      tally(histogram.light, light_residual, seen);
+      Lanes photometric_residual = keep(seen, frame[0] - (settings.gain * intensity + settings.bias));
+      depth_residual = keep(seen, depth_residual * incidence_cosine);
+      tally(histogram.photometric, photometric_residual, seen);
       tally(histogram.depth, depth_residual, seen);
-      sums.agreeing += count(seen & (absolute(light_residual) <= settings.inlier_light) &
+      sums.agreeing += count(seen & (absolute(photometric_residual) <= settings.inlier_color) &
                              (absolute(depth_residual) <= settings.inlier_depth));
 
-      slopes_by_twist(frame[1] * camera.fx * l.inverse_z, frame[2] * camera.fy * l.inverse_z, l.x, l.y, l.z, l.inverse_z,
-                      by_light);
-      by_light[6] = -light;
-      by_light[7] = splat(-1.0f);
-      by_light[8] = Lanes{};
-      for (int i = 0; i < 6; ++i) by_light[8] += by_light[i] * settings.velocity[i];
-      for (int i = 0; i < kUnknowns; ++i) by_light[i] = keep(seen, by_light[i]);
-      for (int i = 0; i < 6; ++i) by_depth[i] = keep(seen, by_depth[i] * d.inverse_z * upright);
+      gradients_by_twist(frame[1] * camera.fx * color_point.inverse_z, frame[2] * camera.fy * color_point.inverse_z,
+                         color_point.x, color_point.y, color_point.z, color_point.inverse_z, by_photometric);
+      by_photometric[6] = -intensity;
+      by_photometric[7] = splat(-1.0f);
+      by_photometric[8] = Lanes{};
+      for (int i = 0; i < 6; ++i) by_photometric[8] += by_photometric[i] * settings.velocity[i];
+      for (int i = 0; i < kUnknowns; ++i) by_photometric[i] = keep(seen, by_photometric[i]);
+      for (int i = 0; i < 6; ++i) by_depth[i] = keep(seen, by_depth[i] * depth_point.inverse_z * incidence_cosine);
 
-      const float light_precision = 1.0f / (settings.light_scale * settings.light_scale);
+      const float photometric_precision = 1.0f / (settings.photometric_scale * settings.photometric_scale);
       const float depth_precision = 1.0f / (settings.depth_scale * settings.depth_scale);
-      const Lanes light_squared = light_residual * light_residual * light_precision;
+      const Lanes photometric_squared = photometric_residual * photometric_residual * photometric_precision;
       const Lanes depth_squared = depth_residual * depth_residual * depth_precision;
-      const Lanes light_weight = robust_weight(light_squared) * light_precision;
+      const Lanes photometric_weight = robust_weight(photometric_squared) * photometric_precision;
       const Lanes depth_weight = robust_weight(depth_squared) * depth_precision;
-      cost += keep(seen, light_squared / (5.0f + light_squared) + depth_squared / (5.0f + depth_squared));
+      cost += keep(seen, photometric_squared / (5.0f + photometric_squared) + depth_squared / (5.0f + depth_squared));
       int entry = 0;
       for (int i = 0; i < kUnknowns; ++i) {
-        const Lanes weighted_light = by_light[i] * light_weight;
+        const Lanes weighted_photometric = by_photometric[i] * photometric_weight;
         if (i < 6) {
           const Lanes weighted_depth = by_depth[i] * depth_weight;
-          g[i] += weighted_light * light_residual + weighted_depth * depth_residual;
-          for (int k = i; k < 6; ++k) H[entry++] += weighted_light * by_light[k] + weighted_depth * by_depth[k];
-          for (int k = 6; k < kUnknowns; ++k) H[entry++] += weighted_light * by_light[k];
+          g[i] += weighted_photometric * photometric_residual + weighted_depth * depth_residual;
+          for (int k = i; k < 6; ++k)
+            H[entry++] += weighted_photometric * by_photometric[k] + weighted_depth * by_depth[k];
+          for (int k = 6; k < kUnknowns; ++k) H[entry++] += weighted_photometric * by_photometric[k];
         } else {
-          g[i] += weighted_light * light_residual;
-          for (int k = i; k < kUnknowns; ++k) H[entry++] += weighted_light * by_light[k];
+          g[i] += weighted_photometric * photometric_residual;
+          for (int k = i; k < kUnknowns; ++k) H[entry++] += weighted_photometric * by_photometric[k];
         }
       }
     }

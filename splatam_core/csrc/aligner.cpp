@@ -10,7 +10,7 @@ namespace {
 
 constexpr float kNone = std::numeric_limits<float>::quiet_NaN();
 
-// The upper edge of the bin that holds the median; see tally() for the bins.
+// Returns the upper edge of the bin that holds the median; tally() defines the bins.
 float median(const std::uint32_t* bins) {
   std::uint64_t total = 0, below = 0;
   for (int bin = 0; bin < kResidualBins; ++bin) total += bins[bin];
@@ -40,22 +40,22 @@ void Aligner::for_rows(int rows, Task&& task) {
 }
 
 Aligner::Result Aligner::linearize(const float* brightness, const float* depth, const Camera& camera,
-                                   const float* layers, const Pose& light_motion, const Pose& depth_motion,
+                                   const float* layers, const Pose& color_motion, const Pose& depth_motion,
                                    const AlignmentSettings& settings) {
   std::vector<AlignmentSums> sums(pool_.size());
   std::vector<ResidualHistogram> histograms(pool_.size());
   for_rows(camera.height, [&](int thread, int begin, int end) {
-    kernels_.align(brightness, depth, camera, begin, end, layers, light_motion, depth_motion, settings, sums[thread],
+    kernels_.align(brightness, depth, camera, begin, end, layers, color_motion, depth_motion, settings, sums[thread],
                    histograms[thread]);
   });
   for (int thread = 1; thread < pool_.size(); ++thread) {
     add(sums[0], sums[thread]);
     for (int bin = 0; bin < kResidualBins; ++bin) {
-      histograms[0].light[bin] += histograms[thread].light[bin];
+      histograms[0].photometric[bin] += histograms[thread].photometric[bin];
       histograms[0].depth[bin] += histograms[thread].depth[bin];
     }
   }
-  return {sums[0], median(histograms[0].light), median(histograms[0].depth)};
+  return {sums[0], median(histograms[0].photometric), median(histograms[0].depth)};
 }
 
 void Aligner::halve(const float* brightness, const float* depth, int width, int height, float max_step,

@@ -1,4 +1,4 @@
-// Direct alignment of a frame to a reference picture of the same camera, on several threads.
+// Direct alignment of a frame to a reference image of the same camera, on several threads.
 #pragma once
 
 #include <vector>
@@ -14,18 +14,19 @@ class Aligner {
 
   struct Result {
     AlignmentSums sums;
-    float light_median, depth_median;  // of the residuals' magnitudes
+    float photometric_median, depth_median;  // of the absolute residuals
   };
 
-  // Repeatable for a fixed number of threads.
+  // Linearises the residuals. The result is repeatable for a fixed number of threads.
   Result linearize(const float* brightness, const float* depth, const Camera&, const float* layers,
-                   const Pose& light_motion, const Pose& depth_motion, const AlignmentSettings&);
+                   const Pose& color_motion, const Pose& depth_motion, const AlignmentSettings&);
 
-  // Half the size: averages of 2x2 blocks, and no depth (NaN) where a block is no surface.
+  // Halves the size: each pixel is the mean of a 2x2 block. Depth is NaN where the block spans a depth edge.
   void halve(const float* brightness, const float* depth, int width, int height, float max_step, float* half_brightness,
              float* half_depth);
 
-  // [H, W, kLayers] of a picture; depth is NaN where it changes by more than max_step of itself from pixel to pixel.
+  // Writes the layers [H, W, kLayers] of an image. Depth is NaN where it changes by more than the fraction max_step
+  // from one pixel to the next.
   void layers(const float* brightness, const float* depth, int width, int height, float max_step, float* layers);
 
  private:

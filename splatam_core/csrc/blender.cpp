@@ -16,7 +16,7 @@ struct Box {  // pixels, the last ones included
   bool empty() const { return left > right || top > bottom; }
 };
 
-// Half widths in px where alpha falls to its minimum; a little more, so that rounding loses no pixel.
+// Returns the box in which alpha is at least its minimum, with a margin of 0.01 px for rounding.
 Box box_of(const float* shape, int width, int height) {
   const float u = shape[0], v = shape[1], a = shape[2], b = shape[3], c = shape[4];
   const float determinant = a * c - b * b, reach = 2 * std::log(shape[5] / kMinimumAlpha) / determinant;
@@ -51,7 +51,8 @@ std::shared_ptr<TileLists> list(const float* shapes, std::size_t count, int widt
   return lists;
 }
 
-// Calls visit(pixel of the tile, pixel of the image, dx, dy, alpha before its limit) wherever an ellipse covers an open pixel.
+// Calls visit(pixel in the tile, pixel in the image, dx, dy, alpha before it is clamped) for each pixel that an ellipse
+// covers and that is not saturated.
 template <typename Visit>
 void for_each_covered(const Box& tile, const float* shape, int width, int height, const float* transmittance,
                       const Visit& visit) {
@@ -93,10 +94,11 @@ void blend_tile(const TileLists& lists, int tile, const float* shapes, const flo
   }
 }
 
-// With w_i = alpha_i T_i and d_i the slope along the features of i, d loss / d alpha_i = T_i d_i - (what lies behind) / (1 -
-// alpha_i), where what lies behind is the sum of w d over the farther ones: all that was drawn less what was met so far.
+// With w_i = alpha_i T_i and d_i the loss's gradient times the features of i, d loss / d alpha_i = T_i d_i - B_i / (1 -
+// alpha_i). B_i is the sum of w_k d_k over the ellipses k behind i: the sum over all of them, less those visited so
+// far.
 void blend_tile_back(const TileLists& lists, int tile, const float* shapes, const float* features, const float* image,
-                     const float* slopes, float* shape_slopes, float* feature_slopes) {
+                     const float* gradients, float* shape_gradients, float* feature_gradients) {
   const Box pixels = pixels_of(lists, tile);
   const std::size_t size = std::size_t(lists.width) * lists.height;
   std::array<float, kTilePixels> transmittance, behind;
@@ -107,22 +109,22 @@ void blend_tile_back(const TileLists& lists, int tile, const float* shapes, cons
       sum = 0;
       for (int k = 0; k < kChannels; ++k) {
         const std::size_t at = k * size + std::size_t(y) * lists.width + x;
-        sum += image[at] * slopes[at];
+        sum += image[at] * gradients[at];
       }
     }
   for (std::size_t entry = lists.begins[tile]; entry < lists.begins[tile + 1]; ++entry) {
     const std::uint32_t id = lists.entries[entry];
     const float *shape = shapes + kShape * id, *feature = features + kFeatures * id;
-    float *by_shape = shape_slopes + kShape * id, *by_feature = feature_slopes + kFeatures * id;
+    float *by_shape = shape_gradients + kShape * id, *by_feature = feature_gradients + kFeatures * id;
     for_each_covered(pixels, shape, lists.width, lists.height, transmittance.data(),
                      [&](int local, std::size_t pixel, float dx, float dy, float unlimited) {
                        const float alpha = std::min(unlimited, kMaximumAlpha);
                        const float T = transmittance[local], weight = alpha * T;
-                       float along = slopes[kFeatures * size + pixel];
+                       float along = gradients[kFeatures * size + pixel];
                        for (int k = 0; k < kFeatures; ++k) {
-                         const float slope = slopes[k * size + pixel];
-                         along += slope * feature[k];
-                         by_feature[k] += weight * slope;
+                         const float gradient = gradients[k * size + pixel];
+                         along += gradient * feature[k];
+                         by_feature[k] += weight * gradient;
                        }
                        behind[local] -= weight * along;
                        transmittance[local] *= 1 - alpha;
@@ -153,23 +155,23 @@ std::shared_ptr<TileLists> Blender::forward(const float* shapes, const float* fe
 }
 
 void Blender::backward(const TileLists& lists, const float* shapes, const float* features, std::size_t count,
-                       const float* image, const float* slopes, float* shape_slopes, float* feature_slopes) {
-  // Which thread adds to what is fixed, so that sums repeat bit for bit.
+                       const float* image, const float* gradients, float* shape_gradients, float* feature_gradients) {
+  // Each tile belongs to a fixed thread, so that sums are repeatable bit for bit.
   const std::size_t per_thread = count * (kShape + kFeatures);
   std::vector<float> sums(per_thread * std::size_t(pool_.size()));
   const int tiles = int(lists.begins.size()) - 1;
   pool_.run([&](int thread) {
     float* by_shape = sums.data() + per_thread * std::size_t(thread);
     for (int tile = thread; tile < tiles; tile += pool_.size())
-      blend_tile_back(lists, tile, shapes, features, image, slopes, by_shape, by_shape + count * kShape);
+      blend_tile_back(lists, tile, shapes, features, image, gradients, by_shape, by_shape + count * kShape);
   });
-  std::fill_n(shape_slopes, count * kShape, 0.0f);
-  std::fill_n(feature_slopes, count * kFeatures, 0.0f);
+  std::fill_n(shape_gradients, count * kShape, 0.0f);
+  std::fill_n(feature_gradients, count * kFeatures, 0.0f);
   for (int thread = 0; thread < pool_.size(); ++thread) {
     const float* by_shape = sums.data() + per_thread * std::size_t(thread);
     const float* by_feature = by_shape + count * kShape;
-    for (std::size_t i = 0; i < count * kShape; ++i) shape_slopes[i] += by_shape[i];
-    for (std::size_t i = 0; i < count * kFeatures; ++i) feature_slopes[i] += by_feature[i];
+    for (std::size_t i = 0; i < count * kShape; ++i) shape_gradients[i] += by_shape[i];
+    for (std::size_t i = 0; i < count * kFeatures; ++i) feature_gradients[i] += by_feature[i];
   }
 }
 

@@ -1,5 +1,5 @@
-// Blends ellipses front to back over tiles of 8x8 pixels, and back: the image half of the anisotropic contract. Where the
-// ellipses come from is not its business.
+// Blends ellipses front to back over tiles of 8x8 pixels, and the backward pass of that: the image half of the
+// anisotropic rasterizer. The projection to ellipses is in rasterizer/ewa.py.
 #pragma once
 
 #include <cstddef>
@@ -15,7 +15,7 @@ constexpr int kShape = 6;     // of an ellipse: u, v, inverse covariance xx xy y
 constexpr int kFeatures = 4;  // red, green, blue, z
 constexpr int kChannels = 5;  // of the image: the features and the silhouette
 
-// Which ellipses may touch which tile, front to back.
+// The ellipses that may touch each tile, front to back.
 struct TileLists {
   int width = 0, height = 0, tiles_x = 0, tiles_y = 0;
   std::vector<std::size_t> begins;  // tiles + 1
@@ -27,12 +27,12 @@ class Blender {
   explicit Blender(int threads) : pool_(threads) {}
 
   // shapes: [count, kShape] front to back; features: [count, kFeatures]; image: [kChannels, height, width].
-  std::shared_ptr<TileLists> forward(const float* shapes, const float* features, std::size_t count, int width, int height,
-                                     float* image);
+  std::shared_ptr<TileLists> forward(const float* shapes, const float* features, std::size_t count, int width,
+                                     int height, float* image);
 
-  // image: what forward drew; slopes: of a loss by it. Writes the loss's slopes by shapes and features.
+  // image: what forward drew; gradients: of a loss by it. Writes the loss's gradients by shapes and features.
   void backward(const TileLists&, const float* shapes, const float* features, std::size_t count, const float* image,
-                const float* slopes, float* shape_slopes, float* feature_slopes);
+                const float* gradients, float* shape_gradients, float* feature_gradients);
 
  private:
   ThreadPool pool_;

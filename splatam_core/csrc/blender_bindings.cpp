@@ -1,4 +1,4 @@
-// Python's view of the blender: numpy arrays in, numpy arrays out, no copies, the GIL released.
+// The blender as Python sees it (splatam_core/_native.pyi).
 #include "blender_bindings.hpp"
 
 #include <pybind11/numpy.h>
@@ -21,12 +21,13 @@ std::shared_ptr<TileLists> forward(Blender& blender, const Array& shapes, const 
 }
 
 void backward(Blender& blender, const TileLists& lists, const Array& shapes, const Array& features, const Array& image,
-              const Array& slopes, Array& shape_slopes, Array& feature_slopes) {
+              const Array& image_gradient, Array& shapes_gradient, Array& features_gradient) {
   const auto count = std::size_t(shapes.shape(0));
-  const float *shape = shapes.data(), *feature = features.data(), *drawn = image.data(), *slope = slopes.data();
-  float *by_shape = shape_slopes.mutable_data(), *by_feature = feature_slopes.mutable_data();
+  const float *shape = shapes.data(), *feature = features.data(), *drawn = image.data();
+  const float* gradient = image_gradient.data();
+  float *by_shape = shapes_gradient.mutable_data(), *by_feature = features_gradient.mutable_data();
   py::gil_scoped_release release;
-  blender.backward(lists, shape, feature, count, drawn, slope, by_shape, by_feature);
+  blender.backward(lists, shape, feature, count, drawn, gradient, by_shape, by_feature);
 }
 
 }  // namespace
@@ -35,8 +36,10 @@ void bind_blender(py::module_& module) {
   py::class_<TileLists, std::shared_ptr<TileLists>>(module, "TileLists");
   py::class_<Blender>(module, "Blender")
       .def(py::init<int>(), py::arg("threads"))
-      .def("forward", &forward)
-      .def("backward", &backward);
+      .def("forward", &forward, py::arg("shapes"), py::arg("features"), py::arg("image").noconvert())
+      .def("backward", &backward, py::arg("lists"), py::kw_only(), py::arg("shapes"), py::arg("features"),
+           py::arg("image"), py::arg("image_gradient"), py::arg("shapes_gradient").noconvert(),
+           py::arg("features_gradient").noconvert());
 }
 
 }  // namespace splatam

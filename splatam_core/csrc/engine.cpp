@@ -14,7 +14,7 @@ constexpr std::size_t kDigits = std::size_t(1) << kDigitBits;
 
 std::size_t blocks_of(std::size_t count) { return (count + kBlock - 1) / kBlock; }
 
-// Part `index` of `parts` of a range.
+// Returns where part `index` of `parts` equal parts of a range begins.
 std::size_t part(std::size_t count, int index, int parts) { return count * std::size_t(index) / std::size_t(parts); }
 
 std::uint32_t depth_bits(float z) {
@@ -24,10 +24,10 @@ std::uint32_t depth_bits(float z) {
   return bits - near;
 }
 
-// Whether any Gaussian within bounds can reach a pixel; where they are not finite, it may.
+// Returns false if no Gaussian within the bounds can reach a pixel. Returns true for bounds that are not finite.
 bool may_be_seen(const float* bounds, const Camera& camera, const Pose& pose) {
-  constexpr float kReach = 3.34f;       // of a Gaussian, in its own deviations: sqrt(2 ln 255), rounded up
-  constexpr float kBlurReach = 1.84f;   // px: that of the blur alone
+  constexpr float kReach = 3.34f;      // of a Gaussian, in standard deviations: sqrt(2 ln 255), rounded up
+  constexpr float kBlurReach = 1.84f;  // of the blur alone, px
   float centre[3], c[3], squared = 0.0f;
   for (int axis = 0; axis < 3; ++axis) {
     centre[axis] = 0.5f * (bounds[axis] + bounds[3 + axis]);
@@ -36,9 +36,10 @@ bool may_be_seen(const float* bounds, const Camera& camera, const Pose& pose) {
   }
   const float radius = std::sqrt(squared), reach = kReach * camera.focal() * std::exp(std::min(bounds[6], 40.0f));
   for (int row = 0; row < 3; ++row)
-    c[row] = pose.R[3 * row] * centre[0] + pose.R[3 * row + 1] * centre[1] + pose.R[3 * row + 2] * centre[2] + pose.t[row];
+    c[row] =
+        pose.R[3 * row] * centre[0] + pose.R[3 * row + 1] * centre[1] + pose.R[3 * row + 2] * centre[2] + pose.t[row];
   if (c[2] + radius <= kNear) return false;
-  // An edge of the image, and the eye, span a plane; a disc may reach over it.
+  // The camera centre and an edge of the image span a plane. A disc may reach across it.
   const auto inside = [&](float across, float focal, float pixels) {
     const float along = pixels + kBlurReach;
     return !(focal * across + along * c[2] + radius * std::sqrt(focal * focal + along * along) + reach < 0.0f);
@@ -111,14 +112,15 @@ void Engine::project(View& view, const GaussianArrays& gaussians, const float* b
   std::atomic<std::size_t> next{0};
   pool_.run([&](int) {
     for (std::size_t block; (block = next.fetch_add(1)) < blocks;)
-      view.block_sizes[block] =
-          bounds && !may_be_seen(bounds + kBounds * block, view.camera, view.pose) ? 0 :
-          kernels_.project(gaussians, view.camera, view.pose, block * kBlock, std::min(count, (block + 1) * kBlock),
-                           view.splats.data(), view.rects.data(), view.ids.data());
+      view.block_sizes[block] = bounds && !may_be_seen(bounds + kBounds * block, view.camera, view.pose)
+                                    ? 0
+                                    : kernels_.project(gaussians, view.camera, view.pose, block * kBlock,
+                                                       std::min(count, (block + 1) * kBlock), view.splats.data(),
+                                                       view.rects.data(), view.ids.data());
   });
 }
 
-// A stable radix sort, lowest digit first; equal depths keep the order of the map.
+// Stable radix sort, lowest digit first: Gaussians of equal depth keep the order of the map.
 void Engine::sort_by_depth(View& view) {
   std::vector<std::size_t> begins(view.block_sizes.size() + 1, 0);
   for (std::size_t block = 0; block < view.block_sizes.size(); ++block)
@@ -158,7 +160,7 @@ void Engine::sort_by_depth(View& view) {
 void Engine::list_tiles(View& view) {
   const std::size_t tiles = std::size_t(view.tiles_x) * view.tiles_y, visible = view.order.size();
   const int parts = pool_.size();
-  std::vector<std::uint32_t> places(tiles * parts, 0);  // per thread, per tile: a thread lists its share of the order
+  std::vector<std::uint32_t> places(tiles * parts, 0);  // [threads, tiles]: each thread lists its part of the order
   view.sorted_rects.resize(visible);
   pool_.run([&](int thread) {
     std::uint32_t* counts = places.data() + tiles * thread;
@@ -181,7 +183,8 @@ void Engine::list_tiles(View& view) {
     const std::size_t last = part(visible, thread + 1, parts);
     for (std::size_t i = part(visible, thread, parts); i < last; ++i) {
       const std::uint32_t splat = std::uint32_t(view.order[i]);
-      visit_tiles(view.sorted_rects[i], view.tiles_x, [&view, next, splat](int tile) { view.entries[next[tile]++] = splat; });
+      visit_tiles(view.sorted_rects[i], view.tiles_x,
+                  [&view, next, splat](int tile) { view.entries[next[tile]++] = splat; });
     }
   });
 }
@@ -197,12 +200,12 @@ void Engine::blend(const View& view, const Images& images) {
 
 namespace {
 
-// From a splat's gradient to its Gaussian's (where wanted) and to the pose's.
+// Adds a splat's gradient to the pose's, and writes its Gaussian's where that is wanted.
 void project_backward(const View& view, std::size_t splat, const SplatGradient& g, const GaussianArrays& gaussians,
                       const MapGradients& map, double pose_gradient[12]) {
   const std::size_t id = view.ids[splat];
-  const GaussianGradient slope = through_projection(view.splats[splat], g, view.camera);
-  const float *mean = gaussians.means + 3 * id, *d = slope.camera;
+  const GaussianGradient by_gaussian = through_projection(view.splats[splat], g, view.camera);
+  const float *mean = gaussians.means + 3 * id, *d = by_gaussian.camera;
   for (int row = 0; row < 3; ++row) {
     for (int column = 0; column < 3; ++column) pose_gradient[4 * row + column] += double(d[row]) * mean[column];
     pose_gradient[4 * row + 3] += d[row];
@@ -210,8 +213,8 @@ void project_backward(const View& view, std::size_t splat, const SplatGradient& 
   if (map.means)
     for (int axis = 0; axis < 3; ++axis)
       map.means[3 * id + axis] = view.pose.R[axis] * d[0] + view.pose.R[3 + axis] * d[1] + view.pose.R[6 + axis] * d[2];
-  if (map.log_scales) map.log_scales[id] = slope.log_scale;
-  if (map.logit_opacities) map.logit_opacities[id] = slope.logit_opacity;
+  if (map.log_scales) map.log_scales[id] = by_gaussian.log_scale;
+  if (map.logit_opacities) map.logit_opacities[id] = by_gaussian.logit_opacity;
   if (map.rgb) {
     map.rgb[3 * id] = g.r;
     map.rgb[3 * id + 1] = g.g;
@@ -219,7 +222,7 @@ void project_backward(const View& view, std::size_t splat, const SplatGradient& 
   }
 }
 
-// One thread's own gradients, zero where splats are.
+// Returns the gradients of one thread, set to zero where there are splats.
 SplatGradient* cleared_gradients(View& view, int thread) {
   SplatGradient* mine = view.gradients.data() + view.num_gaussians * thread;
   for (std::size_t block = 0; block < view.block_sizes.size(); ++block)
@@ -227,7 +230,7 @@ SplatGradient* cleared_gradients(View& view, int thread) {
   return mine;
 }
 
-// Of all threads, left with the first.
+// Sums the gradients of all threads into those of the first.
 const SplatGradient& summed_gradient(View& view, std::size_t splat, int parts) {
   SplatGradient& sum = view.gradients[splat];
   for (int thread = 1; thread < parts; ++thread) {
@@ -238,13 +241,13 @@ const SplatGradient& summed_gradient(View& view, std::size_t splat, int parts) {
   return sum;
 }
 
-// Cuts the tiles into runs of about equal work, always the same ones: sums stay repeatable.
+// Divides the tiles into runs of about equal work. The division depends on the view alone, so that sums are repeatable.
 std::vector<int> balanced_runs(const View& view, int parts) {
   std::vector<int> begins(parts + 1);
   for (int index = 0; index <= parts; ++index) {
     const std::size_t entry = part(view.entries.size(), index, parts);
-    begins[index] = int(std::lower_bound(view.tile_begins.begin(), view.tile_begins.end() - 1, entry) -
-                        view.tile_begins.begin());
+    begins[index] =
+        int(std::lower_bound(view.tile_begins.begin(), view.tile_begins.end() - 1, entry) - view.tile_begins.begin());
   }
   begins[0] = 0;
   begins[parts] = view.tiles_x * view.tiles_y;
@@ -284,12 +287,12 @@ void Engine::backward(View& view, const GaussianArrays& gaussians, const ConstIm
   }
 }
 
-float* Engine::prints(int thread, std::size_t count) {
-  constexpr std::size_t kVector = 8;  // floats; the kernels want whole vectors aligned
-  auto& room = prints_[thread];
-  if (room.size() < count * kFloatsPerPrint + kVector) room.resize(2 * count * kFloatsPerPrint + kVector);
-  const auto address = reinterpret_cast<std::uintptr_t>(room.data()) / sizeof(float);
-  return room.data() + (kVector - address % kVector) % kVector;
+float* Engine::footprints(int thread, std::size_t count) {
+  constexpr std::size_t kVector = 8;  // floats; the kernels need aligned vectors
+  auto& scratch = footprints_[thread];
+  if (scratch.size() < count * kFloatsPerFootprint + kVector) scratch.resize(2 * count * kFloatsPerFootprint + kVector);
+  const auto address = reinterpret_cast<std::uintptr_t>(scratch.data()) / sizeof(float);
+  return scratch.data() + (kVector - address % kVector) % kVector;
 }
 
 double Engine::fit(const MutableGaussians& gaussians, std::size_t count, float* bounds, const AdamState& adam,
@@ -300,13 +303,13 @@ double Engine::fit(const MutableGaussians& gaussians, std::size_t count, float* 
   const int parts = pool_.size();
   const auto runs = balanced_runs(*view, parts);
   std::vector<double> losses(parts, 0.0);
-  prints_.resize(parts);
+  footprints_.resize(parts);
   view->gradients.resize(count * parts);
   pool_.run([&](int thread) {
     SplatGradient* mine = cleared_gradients(*view, thread);
     for (int tile = runs[thread]; tile < runs[thread + 1]; ++tile) {
       const TileList list = view->tile(tile);
-      losses[thread] += kernels_.fit(list, view->splats.data(), camera, target, prints(thread, list.count), mine);
+      losses[thread] += kernels_.fit(list, view->splats.data(), camera, target, footprints(thread, list.count), mine);
     }
   });
   std::atomic<std::size_t> next{0};
@@ -314,8 +317,8 @@ double Engine::fit(const MutableGaussians& gaussians, std::size_t count, float* 
     for (std::size_t block; (block = next.fetch_add(1)) < view->block_sizes.size();) {
       const std::size_t begin = block * kBlock, end = begin + view->block_sizes[block];
       for (std::size_t splat = begin; splat < end; ++splat) summed_gradient(*view, splat, parts);
-      kernels_.update(view->splats.data(), view->ids.data(), view->gradients.data(), begin, end, camera, pose, gaussians,
-                      adam, rates, bounds ? bounds + kBounds * block : nullptr);
+      kernels_.update(view->splats.data(), view->ids.data(), view->gradients.data(), begin, end, camera, pose,
+                      gaussians, adam, rates, bounds ? bounds + kBounds * block : nullptr);
     }
   });
   double loss = 0.0;

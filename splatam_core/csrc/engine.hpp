@@ -1,4 +1,4 @@
-// Stages of a render: project, sort by depth, list per tile, blend; and the same way back.
+// The stages of a render (project, sort by depth, list per tile, blend) and of its backward pass.
 #pragma once
 
 #include <memory>
@@ -10,18 +10,18 @@
 
 namespace splatam {
 
-constexpr std::size_t kBlock = 1024;  // Gaussians that are projected, or skipped, together
-constexpr int kBounds = 7;            // of a block: smallest mean, largest mean, largest log scale
+constexpr std::size_t kBlock = 1024;  // Gaussians per block; a block is projected or skipped as a whole
+constexpr int kBounds = 7;            // floats per block: smallest mean (3), largest mean (3), largest log scale
 
-// What a forward pass leaves for its backward pass. Projected Gaussians lie in blocks of kBlock with gaps between.
+// What a forward pass stores for its backward pass. Projected Gaussians are stored in blocks of kBlock, with gaps.
 struct View {
   Camera camera;
   Pose pose;
   std::size_t num_gaussians = 0;
   std::vector<Splat> splats;
   std::vector<TileRect> rects, sorted_rects;  // the latter by depth
-  std::vector<std::uint32_t> ids;        // splat -> Gaussian
-  std::vector<std::size_t> block_sizes;  // visible Gaussians per block
+  std::vector<std::uint32_t> ids;             // splat -> Gaussian
+  std::vector<std::size_t> block_sizes;       // visible Gaussians per block
   std::vector<std::uint64_t> order, scratch;  // depth bits << 32 | splat
   std::vector<std::uint32_t> entries;         // splats, tile by tile, front to back
   std::vector<std::size_t> tile_begins;       // tiles + 1
@@ -31,7 +31,7 @@ struct View {
   TileList tile(int index) const;
 };
 
-struct MapGradients {  // each may be null: not wanted
+struct MapGradients {  // null where a gradient is not wanted
   float *means, *log_scales, *logit_opacities, *rgb;
 };
 
@@ -39,15 +39,16 @@ class Engine : public std::enable_shared_from_this<Engine> {
  public:
   explicit Engine(int threads) : kernels_(best_kernels()), pool_(threads) {}
 
-  // bounds: kBounds for each block, which then may be skipped; or null.
-  std::shared_ptr<View> forward(const GaussianArrays&, std::size_t count, const float* bounds, const Camera&, const Pose&,
-                                const Images&);
+  // bounds: [blocks, kBounds], by which blocks out of view are skipped; may be null.
+  std::shared_ptr<View> forward(const GaussianArrays&, std::size_t count, const float* bounds, const Camera&,
+                                const Pose&, const Images&);
 
-  // Writes gradients of the visible Gaussians (map.* must be zeroed) and of the pose's twelve entries, row by row.
+  // Writes the gradients by the visible Gaussians (the others are not written: zero map.* before) and by the upper
+  // three rows of the pose.
   void backward(View&, const GaussianArrays&, const ConstImages& drawn, const ConstImages& gradient,
                 const MapGradients& map, float pose_gradient[12]);
 
-  // One Adam step of the visible Gaussians towards a target seen from a pose (Huber). Returns the loss before it.
+  // Takes one Adam step of the visible Gaussians towards a target (Huber loss). Returns the loss before the step.
   double fit(const MutableGaussians&, std::size_t count, float* bounds, const AdamState&, const AdamRates&,
              const Camera&, const Pose&, const Target&);
 
@@ -57,7 +58,7 @@ class Engine : public std::enable_shared_from_this<Engine> {
   std::shared_ptr<View> borrow_view();
   std::shared_ptr<View> list(const GaussianArrays&, std::size_t count, const float* bounds, const Camera&, const Pose&);
   void project(View&, const GaussianArrays&, const float* bounds);
-  float* prints(int thread, std::size_t count);  // scratch of Kernels::fit
+  float* footprints(int thread, std::size_t count);  // scratch of Kernels::fit
   void sort_by_depth(View&);
   void list_tiles(View&);
   void blend(const View&, const Images&);
@@ -65,8 +66,8 @@ class Engine : public std::enable_shared_from_this<Engine> {
   const Kernels& kernels_;
   ThreadPool pool_;
   std::mutex mutex_, spare_mutex_;
-  std::vector<std::vector<float>> prints_;  // per thread
-  std::vector<std::unique_ptr<View>> spare_;  // kept: allocating anew costs more page faults than the work
+  std::vector<std::vector<float>> footprints_;  // per thread
+  std::vector<std::unique_ptr<View>> spare_;    // reused: page faults of new memory cost more than the work
 };
 
 }  // namespace splatam

@@ -1,4 +1,4 @@
-// The inner loops, compiled once per instruction set and chosen at run time.
+// The inner loops. They are compiled once per instruction set and chosen at run time.
 #pragma once
 
 #include <cstddef>
@@ -6,9 +6,9 @@
 
 namespace splatam {
 
-constexpr int kTile = 8;           // pixels on a side
-constexpr float kNear = 0.2f;      // metres
-constexpr float kBlur = 0.3f;      // px^2
+constexpr int kTile = 8;       // pixels on a side
+constexpr float kNear = 0.2f;  // metres
+constexpr float kBlur = 0.3f;  // px^2
 constexpr float kMaxAlpha = 0.99f;
 constexpr float kMinAlpha = 1.0f / 255.0f;
 constexpr float kMinTransmittance = 1e-4f;
@@ -23,13 +23,13 @@ struct Pose {  // world to camera
   float R[9], t[3];
 };
 
-// A Gaussian on the image. alpha(d) = opacity exp(falloff d^2).
+// A projected Gaussian: alpha(d) = opacity exp(falloff d^2) at d pixels from (u, v).
 struct Splat {
   float u, v, falloff, opacity, r, g, b, z;
 };
 
-// The tiles that a splat's disc touches: columns x0..x1, rows y0..y1, less the corners (top left, top right, bottom
-// left, bottom right: bits 0 to 3) that the disc misses.
+// The tiles that a splat's disc touches: columns x0..x1 and rows y0..y1, without the corners that the disc misses (bits
+// 0 to 3: top left, top right, bottom left, bottom right).
 struct TileRect {
   std::uint16_t x0, y0, x1, y1 : 12, missed_corners : 4;
 };
@@ -56,25 +56,25 @@ struct MutableGaussians {
   float *means, *log_scales, *logit_opacities, *rgb;
 };
 
-// What a view should look like, and how much a difference weighs, per pixel and channel.
+// The images that a view is fitted to, and the weights of a difference per pixel and channel.
 struct Target {
   const std::uint8_t* rgb;  // [H, W, 3]
   const float* depth;       // [H, W] metres, 0 = no reading
   float color_weight, depth_weight;
-  float color_limit, depth_limit;  // up to which Huber's loss is a parabola
+  float color_limit, depth_limit;  // up to here Huber's loss is quadratic
 };
 
 // Adam (Kingma and Ba 2015). A Gaussian's values in this order: mean, log scale, logit opacity, rgb.
 struct AdamState {
-  float* moments;        // [N, 16]: first moments, then second
-  std::uint8_t* steps;   // [N], counts to 255
+  float* moments;       // [N, 16]: first moments, then second
+  std::uint8_t* steps;  // [N], counts to 255
 };
 
 struct AdamRates {
   float means, log_scales, logit_opacities, rgb;
 };
 
-constexpr int kFloatsPerPrint = 32;  // what a splat is to one tile, see kernels.inl
+constexpr int kFloatsPerFootprint = 32;  // size of a Footprint, see kernels.inl
 
 struct TileList {
   int x, y;  // pixel of its upper left corner
@@ -82,37 +82,39 @@ struct TileList {
   std::size_t count;
 };
 
-// One picture of an alignment: brightness, its slopes along u and v, depth in metres, its slopes; then two of padding,
-// so that a pixel is a vector. NaN in the depth marks what is no surface.
+// Layers of an image that is aligned: brightness, its gradients along u and v, depth in metres, its gradients, and two
+// of padding, so that a pixel fills a vector. NaN depth marks pixels that are not on a surface.
 constexpr int kLayers = 8;
 
-// The linearised residuals of an alignment, sum by sum. Unknowns: six of the twist, then the light's gain, bias and lag.
+// The sums of the linearised residuals of an alignment. Unknowns: the twist (6), gain and bias of the brightness, and
+// the time offset between colour and depth.
 constexpr int kUnknowns = 9;
 struct AlignmentSums {
   double H[kUnknowns * (kUnknowns + 1) / 2];  // upper triangle, row by row
   double g[kUnknowns];
-  double cost;             // of the seen points, each below one per kind of residual
-  // Points with depth; of those, the ones that fall on depth in the frame; on the same surface; with residuals that agree.
+  double cost;  // of the seen points; each residual adds less than one
+  // Points with depth; of these, points that project onto a depth reading of the frame; of these, points on the same
+  // surface (seen); of these, points whose residuals are inliers.
   std::int64_t points, compared, seen, agreeing;
 };
 
 struct AlignmentSettings {
-  float gain, bias;                     // of the light: frame = gain * reference + bias
-  float velocity[6];                    // twist a frame: how the light's pose changes with its lag
-  float light_scale, depth_scale;       // of the residuals; that of depth is relative
-  float max_depth_ratio;                // larger differences are other surfaces
-  float inlier_light, inlier_depth;     // what counts as agreeing
+  float gain, bias;   // brightness of the frame = gain * brightness of the reference + bias
+  float velocity[6];  // twist per frame interval: how the pose at the colour image's time changes with the time offset
+  float photometric_scale, depth_scale;  // of the residuals; that of depth is relative to the depth
+  float max_depth_ratio;                 // points that differ by more are on another surface
+  float inlier_color, inlier_depth;      // largest residuals of an inlier
 };
 
-// Residuals by magnitude, in bins of an eighth of an octave: their median is wanted, not their order.
+// Histogram of the absolute residuals, for their median. A bin is an eighth of an octave.
 constexpr int kResidualBins = 1024;
 struct ResidualHistogram {
-  std::uint32_t light[kResidualBins], depth[kResidualBins];
+  std::uint32_t photometric[kResidualBins], depth[kResidualBins];
 };
 
-// A splat's gradient, back through its projection.
+// The gradient by a Gaussian's parameters: a SplatGradient passed back through the projection.
 struct GaussianGradient {
-  float camera[3];  // of the centre, in camera coordinates
+  float camera[3];  // by the centre in camera coordinates
   float log_scale, logit_opacity;
 };
 
@@ -134,23 +136,24 @@ struct Kernels {
   std::size_t (*project)(const GaussianArrays&, const Camera&, const Pose&, std::size_t begin, std::size_t end,
                          Splat* splats, TileRect* rects, std::uint32_t* ids);
   void (*forward)(const TileList&, const Splat*, const Camera&, const Images&);
-  // Adds to gradients. Without `map`, the colour gradients stay as they are.
+  // Adds to the gradients. Skips those by the colours unless `map` is set.
   void (*backward)(const TileList&, const Splat*, const Camera&, const ConstImages& drawn, const ConstImages& gradient,
                    bool map, SplatGradient* gradients);
-  // Blends a tile, compares it to the target (Huber) and adds the gradients in one go. Returns the tile's loss.
-  // `prints` is scratch of kFloatsPerPrint for each splat of the list.
-  double (*fit)(const TileList&, const Splat* splats, const Camera&, const Target&, float* prints,
+  // Blends a tile, compares it with the target (Huber) and adds the gradients. Returns the tile's loss.
+  // `footprints` is scratch memory of kFloatsPerFootprint floats per splat of the list.
+  double (*fit)(const TileList&, const Splat* splats, const Camera&, const Target&, float* footprints,
                 SplatGradient* gradients);
 
-  // Adam steps of Gaussians ids[i], i in [begin, end), whose splats have gradients; bounds (of their block) grow along.
+  // Takes an Adam step of the Gaussians ids[i], i in [begin, end), whose splats have gradients. Extends the bounds of
+  // their block.
   void (*update)(const Splat* splats, const std::uint32_t* ids, const SplatGradient* gradients, std::size_t begin,
                  std::size_t end, const Camera&, const Pose&, const MutableGaussians&, const AdamState&,
                  const AdamRates&, float* bounds);
 
-  // Rows [begin, end) of a reference [H, W] against a frame's layers: how the camera should move, and what agrees.
-  // The frame's light may have been taken at another time than its depth, so each has its own motion.
+  // Linearises the residuals of rows [begin, end) of a reference [H, W] in a frame, and counts the inliers. The frame's
+  // colour may have been taken at another time than its depth, so each has its own camera motion.
   void (*align)(const float* brightness, const float* depth, const Camera&, int begin, int end, const float* layers,
-                const Pose& light_motion, const Pose& depth_motion, const AlignmentSettings&, AlignmentSums&,
+                const Pose& color_motion, const Pose& depth_motion, const AlignmentSettings&, AlignmentSums&,
                 ResidualHistogram&);
 
   const char* name;
@@ -162,7 +165,8 @@ const Kernels& kernels_avx2();
 const Kernels& kernels_avx512();
 #endif
 
-// The fastest that this processor runs; SPLATAM_ISA=generic|avx2|avx512 lowers the choice.
+// Returns the kernels of the best instruction set that this processor has. SPLATAM_ISA=generic|avx2|avx512 limits the
+// choice.
 const Kernels& best_kernels();
 
 }  // namespace splatam

@@ -12,11 +12,14 @@ static inline TileRect touched_tiles(float u, float v, float extent, const Camer
   rect.missed_corners = 0;
   if (rect.x0 == rect.x1 || rect.y0 == rect.y1) return rect;
   // Distance from the centre to the nearest pixel of the outer columns and rows.
-  const float left = clamp(u - float(rect.x0 * kTile + kTile - 1), 0.0f, 1e9f), above = clamp(v - float(rect.y0 * kTile + kTile - 1), 0.0f, 1e9f);
-  const float past = clamp(float(rect.x1 * kTile) - u, 0.0f, 1e9f), below = clamp(float(rect.y1 * kTile) - v, 0.0f, 1e9f);
+  const float left = clamp(u - float(rect.x0 * kTile + kTile - 1), 0.0f, 1e9f),
+              above = clamp(v - float(rect.y0 * kTile + kTile - 1), 0.0f, 1e9f);
+  const float past = clamp(float(rect.x1 * kTile) - u, 0.0f, 1e9f),
+              below = clamp(float(rect.y1 * kTile) - v, 0.0f, 1e9f);
   const float limit = extent * extent;
-  rect.missed_corners = std::uint16_t((left * left + above * above > limit) | (past * past + above * above > limit) << 1 |
-                                      (left * left + below * below > limit) << 2 | (past * past + below * below > limit) << 3);
+  rect.missed_corners =
+      std::uint16_t((left * left + above * above > limit) | (past * past + above * above > limit) << 1 |
+                    (left * left + below * below > limit) << 2 | (past * past + below * below > limit) << 3);
   return rect;
 }
 
@@ -59,7 +62,7 @@ static std::size_t project(const GaussianArrays& gaussians, const Camera& camera
   return visible - begin;
 }
 
-// What a splat is to one tile: dx per column, and both separable factors of its alpha.
+// A splat within one tile: its offsets, and the two separable factors of its alpha (per column, per row).
 struct Footprint {
   Lanes dx, across;
   float dy[8], down[8];
@@ -75,7 +78,7 @@ static inline Footprint footprint(const Splat& s, const TileList& tile) {
   return f;
 }
 
-// Lanes of a tile's row that lie on the image.
+// Returns a mask of the lanes of a tile's row that are inside the image.
 static inline IntLanes on_image(const TileList& tile, const Camera& camera, int row) {
   const float columns = tile.y + row < camera.height ? float(camera.width - tile.x) : 0.0f;
   return iota() < columns;
@@ -83,8 +86,8 @@ static inline IntLanes on_image(const TileList& tile, const Camera& camera, int 
 
 constexpr int kPairs = kTile / 2;
 
-// Whether no pixel of a tile takes any more; Rows is Pixels or Slopes. To be asked after 16 splats at most: until then
-// the transmittance of those that do not has become small, but no denormal number.
+// Returns whether every pixel of a tile is saturated. Rows is Pixels or PixelGradients. Call it at least every 16
+// splats: it also resets the transmittance of saturated pixels, before that becomes a denormal number.
 template <typename Rows>
 static inline bool opaque(Rows* rows) {
   IntPair open{};
@@ -144,23 +147,22 @@ static inline void blend(Pixels& pixels, Pair raw_alpha, const Splat& s) {
   pixels.b += w * s.b;
   pixels.depth += w * s.z;
   pixels.silhouette += w;
-  pixels.T *= 1.0f - alpha;  // also of pixels that take no more: the shortest way to the next splat's T
+  pixels.T *= 1.0f - alpha;  // also in saturated pixels: the shortest path to the next splat's T
 }
 
-// A splat's alpha in two rows, not clamped.
+// Returns a splat's alpha in two rows, before it is clamped.
 static inline Pair raw_alpha(const Footprint& f, int row) {
   return pair(f.down[row], f.down[row + 1]) * pair(f.across, f.across);
 }
 
 constexpr std::size_t kBatch = 16;
 
-// Blends up to kBatch splats into a tile. Pair by pair: the pixels stay in registers. No pair is left out where a splat
-// does not reach: branches that are guessed wrong cost more than blending nothing.
-static inline void blend(Pixels* pixels, const Splat* batch, const Footprint* prints, std::size_t size) {
+// Blends up to kBatch splats into a tile, pair of rows by pair, so that the pixels stay in registers. Pairs that a
+// splat does not reach are not skipped: mispredicted branches cost more than blending zeros.
+static inline void blend(Pixels* pixels, const Splat* batch, const Footprint* footprints, std::size_t size) {
   for (int i = 0; i < kPairs; ++i) {
     Pixels rows = pixels[i];
-    for (std::size_t k = 0; k < size; ++k)
-      blend(rows, raw_alpha(prints[k], 2 * i), batch[k]);
+    for (std::size_t k = 0; k < size; ++k) blend(rows, raw_alpha(footprints[k], 2 * i), batch[k]);
     pixels[i] = rows;
   }
 }
@@ -170,14 +172,14 @@ static void forward(const TileList& tile, const Splat* splats, const Camera& cam
   Pixels pixels[kPairs];
   start(pixels, tile, camera);
   Splat batch[kBatch];
-  Footprint prints[kBatch];
+  Footprint footprints[kBatch];
   for (std::size_t first = 0; first < tile.count && !opaque(pixels); first += kBatch) {
     const std::size_t size = tile.count - first < kBatch ? tile.count - first : kBatch;
     for (std::size_t k = 0; k < size; ++k) {
       batch[k] = splats[tile.splats[first + k]];
-      prints[k] = footprint(batch[k], tile);
+      footprints[k] = footprint(batch[k], tile);
     }
-    blend(pixels, batch, prints, size);
+    blend(pixels, batch, footprints, size);
   }
   for (int i = 0; i < kPairs; ++i) {
     store_rows(images.rgb, tile, camera, 2 * i, pixels[i].r);
@@ -188,30 +190,29 @@ static void forward(const TileList& tile, const Splat* splats, const Camera& cam
   }
 }
 
-// Two rows on the way back, which goes front to back again.
-struct Slopes {
-  Pair T, Q;                           // transmittance; what is still to come of sum_k w_k q_k, see descend()
-  Pair r, g, b, depth, silhouette;     // the loss's gradient by what the pixels show
+// Two rows in the backward pass, which also goes front to back.
+struct PixelGradients {
+  Pair T, Q;                        // transmittance; the part of sum_k w_k q_k that is still to come, see blend_back()
+  Pair r, g, b, depth, silhouette;  // gradients of the loss by the pixel's values
 };
 
-// One splat of the backward pass. With q_k = sum over channels of (gradient times what k adds), the whole of it is
+// The backward pass of one splat. With q_k = sum over channels of (gradient of the channel times value of splat k),
 // dL/dalpha_k = T_k q_k - Q / (1 - alpha_k).
 template <bool kMap>
-static inline void descend(Slopes* slopes, const Splat& s, const Footprint& f, SplatGradient& gradient) {
+static inline void blend_back(PixelGradients* rows, const Splat& s, const Footprint& f, SplatGradient& gradient) {
   Pair by_alpha{}, by_y{}, by_y_squared{}, by_r{}, by_g{}, by_b{}, by_z{};
   for (int i = 0; i < kPairs; ++i) {
-
-    Slopes& at = slopes[i];
+    PixelGradients& at = rows[i];
     const Pair raw = raw_alpha(f, 2 * i), dy = pair(f.dy[2 * i], f.dy[2 * i + 1]);
     const Pair alpha = keep(raw >= kMinAlpha, min(raw, kMaxAlpha));
     const IntPair takes = at.T >= kMinTransmittance;
     const Pair w = keep(takes, alpha * at.T), left = 1.0f - alpha;
     const Pair q = at.r * s.r + at.g * s.g + at.b * s.b + at.depth * s.z + at.silhouette;
     at.Q -= w * q;
-    const Pair slope = keep(takes & (raw <= kMaxAlpha), alpha * (at.T * q - at.Q / left));
-    by_alpha += slope;
-    by_y += slope * dy;
-    by_y_squared += slope * dy * dy;
+    const Pair gradient_by_log_alpha = keep(takes & (raw <= kMaxAlpha), alpha * (at.T * q - at.Q / left));
+    by_alpha += gradient_by_log_alpha;
+    by_y += gradient_by_log_alpha * dy;
+    by_y_squared += gradient_by_log_alpha * dy * dy;
     if (kMap) {
       by_r += w * at.r;
       by_g += w * at.g;
@@ -232,20 +233,20 @@ template <bool kMap>
 static inline void backward_tile(const TileList& tile, const Splat* splats, const Camera& camera,
                                  const ConstImages& drawn, const ConstImages& gradient, SplatGradient* gradients) {
   const std::size_t plane = std::size_t(camera.width) * camera.height;
-  Slopes slopes[kPairs];
+  PixelGradients rows[kPairs];
   for (int i = 0; i < kPairs; ++i) {
-    const auto rows = [&](const float* image) { return load_rows(image, tile, camera, 2 * i); };
-    Slopes& at = slopes[i];
+    const auto load = [&](const float* image) { return load_rows(image, tile, camera, 2 * i); };
+    PixelGradients& at = rows[i];
     at.T = first_transmittance(tile, camera, 2 * i);
-    at.r = rows(gradient.rgb), at.g = rows(gradient.rgb + plane), at.b = rows(gradient.rgb + 2 * plane);
-    at.depth = rows(gradient.depth), at.silhouette = rows(gradient.silhouette);
-    at.Q = at.r * rows(drawn.rgb) + at.g * rows(drawn.rgb + plane) + at.b * rows(drawn.rgb + 2 * plane) +
-           at.depth * rows(drawn.depth) + at.silhouette * rows(drawn.silhouette);
+    at.r = load(gradient.rgb), at.g = load(gradient.rgb + plane), at.b = load(gradient.rgb + 2 * plane);
+    at.depth = load(gradient.depth), at.silhouette = load(gradient.silhouette);
+    at.Q = at.r * load(drawn.rgb) + at.g * load(drawn.rgb + plane) + at.b * load(drawn.rgb + 2 * plane) +
+           at.depth * load(drawn.depth) + at.silhouette * load(drawn.silhouette);
   }
   for (std::size_t k = 0; k < tile.count; ++k) {
-    if (k % 8 == 7 && opaque(slopes)) break;
+    if (k % 8 == 7 && opaque(rows)) break;
     const Splat& s = splats[tile.splats[k]];
-    descend<kMap>(slopes, s, footprint(s, tile), gradients[tile.splats[k]]);
+    blend_back<kMap>(rows, s, footprint(s, tile), gradients[tile.splats[k]]);
   }
 }
 
@@ -257,7 +258,7 @@ static void backward(const TileList& tile, const Splat* splats, const Camera& ca
     backward_tile<false>(tile, splats, camera, drawn, gradient, gradients);
 }
 
-static_assert(sizeof(Footprint) == kFloatsPerPrint * sizeof(float), "scratch is allocated elsewhere");
+static_assert(sizeof(Footprint) == kFloatsPerFootprint * sizeof(float), "scratch is allocated elsewhere");
 
 static inline Lanes load_bytes(const std::uint8_t* pixels, int columns, int channel) {
   Lanes values{};
@@ -265,20 +266,20 @@ static inline Lanes load_bytes(const std::uint8_t* pixels, int columns, int chan
   return values * (1.0f / 255.0f);
 }
 
-// Huber's loss of one row, its gradient, and what the gradient sums to over the row's splats (Q of descend()).
+// Huber's loss of one row, its gradient by the pixel values, and Q of blend_back() before the first splat.
 struct Comparison {
   Lanes r, g, b, depth, Q;
   double loss;
 };
 
-// Slope of Huber's loss: that of a parabola up to the limit, one beyond.
-static inline Lanes slope_of(Lanes residual, float limit) {
-  const Lanes slope = residual * (1.0f / limit);
-  return max(min(slope, splat(1.0f)), splat(-1.0f));
+// Gradient of Huber's loss: linear up to the limit, constant beyond.
+static inline Lanes huber_gradient(Lanes residual, float limit) {
+  const Lanes gradient = residual * (1.0f / limit);
+  return max(min(gradient, splat(1.0f)), splat(-1.0f));
 }
 
-static inline Lanes loss_of(Lanes residual, Lanes slope, float limit) {
-  return slope * (residual - 0.5f * limit * slope);
+static inline Lanes huber_loss(Lanes residual, Lanes gradient, float limit) {
+  return gradient * (residual - 0.5f * limit * gradient);
 }
 
 static inline Comparison compare(Lanes r, Lanes g, Lanes b, Lanes depth, const TileList& tile, const Camera& camera,
@@ -291,13 +292,15 @@ static inline Comparison compare(Lanes r, Lanes g, Lanes b, Lanes depth, const T
   Lanes reading{};
   __builtin_memcpy(&reading, target.depth + at, sizeof(float) * columns);
   const std::uint8_t* colors = target.rgb + 3 * at;
-  const Lanes red = keep(real, r - load_bytes(colors, columns, 0)), by_r = slope_of(red, target.color_limit);
-  const Lanes green = keep(real, g - load_bytes(colors, columns, 1)), by_g = slope_of(green, target.color_limit);
-  const Lanes blue = keep(real, b - load_bytes(colors, columns, 2)), by_b = slope_of(blue, target.color_limit);
-  const Lanes range = keep(real & (reading > 0.0f), depth - reading), by_range = slope_of(range, target.depth_limit);
-  const Lanes loss = target.color_weight * (loss_of(red, by_r, target.color_limit) + loss_of(green, by_g, target.color_limit) +
-                                            loss_of(blue, by_b, target.color_limit)) +
-                     target.depth_weight * loss_of(range, by_range, target.depth_limit);
+  const Lanes red = keep(real, r - load_bytes(colors, columns, 0)), by_r = huber_gradient(red, target.color_limit);
+  const Lanes green = keep(real, g - load_bytes(colors, columns, 1)), by_g = huber_gradient(green, target.color_limit);
+  const Lanes blue = keep(real, b - load_bytes(colors, columns, 2)), by_b = huber_gradient(blue, target.color_limit);
+  const Lanes range = keep(real & (reading > 0.0f), depth - reading),
+              by_range = huber_gradient(range, target.depth_limit);
+  const Lanes loss =
+      target.color_weight * (huber_loss(red, by_r, target.color_limit) + huber_loss(green, by_g, target.color_limit) +
+                             huber_loss(blue, by_b, target.color_limit)) +
+      target.depth_weight * huber_loss(range, by_range, target.depth_limit);
   for (int i = 0; i < 8; ++i) result.loss += loss[i];
   result.r = target.color_weight * by_r, result.g = target.color_weight * by_g, result.b = target.color_weight * by_b;
   result.depth = target.depth_weight * by_range;
@@ -305,19 +308,26 @@ static inline Comparison compare(Lanes r, Lanes g, Lanes b, Lanes depth, const T
   return result;
 }
 
-// Both rows of a pair against the target. Returns their loss.
-static inline double start(Slopes& slopes, const Pixels& drawn, const TileList& tile, const Camera& camera, int row,
-                           const Target& target) {
-  const Comparison a = compare(upper(drawn.r), upper(drawn.g), upper(drawn.b), upper(drawn.depth), tile, camera, row, target);
-  const Comparison b = compare(lower(drawn.r), lower(drawn.g), lower(drawn.b), lower(drawn.depth), tile, camera, row + 1, target);
-  slopes = {first_transmittance(tile, camera, row), pair(a.Q, b.Q), pair(a.r, b.r), pair(a.g, b.g), pair(a.b, b.b),
-            pair(a.depth, b.depth), Pair{}};
+// Starts the backward pass of two rows: compares them with the target. Returns their loss.
+static inline double start(PixelGradients& rows, const Pixels& drawn, const TileList& tile, const Camera& camera,
+                           int row, const Target& target) {
+  const Comparison a =
+      compare(upper(drawn.r), upper(drawn.g), upper(drawn.b), upper(drawn.depth), tile, camera, row, target);
+  const Comparison b =
+      compare(lower(drawn.r), lower(drawn.g), lower(drawn.b), lower(drawn.depth), tile, camera, row + 1, target);
+  rows = {first_transmittance(tile, camera, row),
+          pair(a.Q, b.Q),
+          pair(a.r, b.r),
+          pair(a.g, b.g),
+          pair(a.b, b.b),
+          pair(a.depth, b.depth),
+          Pair{}};
   return a.loss + b.loss;
 }
 
 static double fit(const TileList& tile, const Splat* splats, const Camera& camera, const Target& target, float* scratch,
                   SplatGradient* gradients) {
-  Footprint* prints = reinterpret_cast<Footprint*>(scratch);
+  Footprint* footprints = reinterpret_cast<Footprint*>(scratch);
   Pixels pixels[kPairs];
   start(pixels, tile, camera);
   Splat batch[kBatch];
@@ -326,16 +336,16 @@ static double fit(const TileList& tile, const Splat* splats, const Camera& camer
     const std::size_t size = tile.count - count < kBatch ? tile.count - count : kBatch;
     for (std::size_t k = 0; k < size; ++k) {
       batch[k] = splats[tile.splats[count + k]];
-      prints[count + k] = footprint(batch[k], tile);
+      footprints[count + k] = footprint(batch[k], tile);
     }
-    blend(pixels, batch, prints + count, size);
+    blend(pixels, batch, footprints + count, size);
     count += size;
   }
   double loss = 0.0;
-  Slopes slopes[kPairs];
-  for (int i = 0; i < kPairs; ++i) loss += start(slopes[i], pixels[i], tile, camera, 2 * i, target);
+  PixelGradients rows[kPairs];
+  for (int i = 0; i < kPairs; ++i) loss += start(rows[i], pixels[i], tile, camera, 2 * i, target);
   for (std::size_t k = 0; k < count; ++k)
-    descend<true>(slopes, splats[tile.splats[k]], prints[k], gradients[tile.splats[k]]);
+    blend_back<true>(rows, splats[tile.splats[k]], footprints[k], gradients[tile.splats[k]]);
   return loss;
 }
 
@@ -344,21 +354,25 @@ constexpr float kBeta1 = 0.9f, kBeta2 = 0.99f, kEpsilon = 1e-15f;
 static void update(const Splat* splats, const std::uint32_t* ids, const SplatGradient* gradients, std::size_t begin,
                    std::size_t end, const Camera& camera, const Pose& pose, const MutableGaussians& gaussians,
                    const AdamState& adam, const AdamRates& rates, float* bounds) {
-  float left1[256], left2[256];  // what bias correction divides by
+  float left1[256], left2[256];  // Adam's bias corrections: 1 minus these
   left1[0] = left2[0] = 1.0f;
   for (int i = 1; i < 256; ++i) left1[i] = left1[i - 1] * kBeta1, left2[i] = left2[i - 1] * kBeta2;
-  const Lanes rate = {rates.means, rates.means, rates.means, rates.log_scales, rates.logit_opacities,
-                      rates.rgb,   rates.rgb,   rates.rgb};
+  const Lanes rate = {rates.means,           rates.means, rates.means, rates.log_scales,
+                      rates.logit_opacities, rates.rgb,   rates.rgb,   rates.rgb};
   for (std::size_t splat_index = begin; splat_index < end; ++splat_index) {
     const SplatGradient& g = gradients[splat_index];
     if (g.log_alpha == 0.0f && g.r == 0.0f && g.g == 0.0f && g.b == 0.0f && g.z == 0.0f) continue;
     const std::size_t id = ids[splat_index];
-    const GaussianGradient slope = through_projection(splats[splat_index], g, camera);
-    const float *R = pose.R, *d = slope.camera;
+    const GaussianGradient by_gaussian = through_projection(splats[splat_index], g, camera);
+    const float *R = pose.R, *d = by_gaussian.camera;
     const Lanes gradient = {R[0] * d[0] + R[3] * d[1] + R[6] * d[2],
                             R[1] * d[0] + R[4] * d[1] + R[7] * d[2],
                             R[2] * d[0] + R[5] * d[1] + R[8] * d[2],
-                            slope.log_scale, slope.logit_opacity, g.r, g.g, g.b};
+                            by_gaussian.log_scale,
+                            by_gaussian.logit_opacity,
+                            g.r,
+                            g.g,
+                            g.b};
     float* moments = adam.moments + 16 * id;
     const Lanes first = kBeta1 * load(moments) + (1.0f - kBeta1) * gradient;
     const Lanes second = kBeta2 * load(moments + 8) + (1.0f - kBeta2) * gradient * gradient;
@@ -382,6 +396,4 @@ static void update(const Splat* splats, const std::uint32_t* ids, const SplatGra
   }
 }
 
-static constexpr Kernels table(const char* name) {
-  return {project, forward, backward, fit, update, align, name};
-}
+static constexpr Kernels table(const char* name) { return {project, forward, backward, fit, update, align, name}; }

@@ -13,7 +13,7 @@ namespace avx2 {
 #include "lanes.inl"
 #include "align.inl"
 #include "kernels.inl"
-}
+}  // namespace avx2
 }  // namespace splatam
 #if defined(__clang__)
 #pragma clang attribute pop

@@ -2,7 +2,8 @@
 #include "kernels.hpp"
 
 #if defined(__clang__)
-#pragma clang attribute push(__attribute__((target("avx2,fma,avx512f,avx512vl,avx512dq,avx512bw"))), apply_to = function)
+#pragma clang attribute push(__attribute__((target("avx2,fma,avx512f,avx512vl,avx512dq,avx512bw"))), \
+                             apply_to = function)
 #else
 #pragma GCC push_options
 #pragma GCC target("avx2,fma,avx512f,avx512vl,avx512dq,avx512bw")
@@ -13,7 +14,7 @@ namespace avx512 {
 #include "lanes.inl"
 #include "align.inl"
 #include "kernels.inl"
-}
+}  // namespace avx512
 }  // namespace splatam
 #if defined(__clang__)
 #pragma clang attribute pop

@@ -6,7 +6,7 @@ namespace generic {
 #include "lanes.inl"
 #include "align.inl"
 #include "kernels.inl"
-}
+}  // namespace generic
 const Kernels& kernels_generic() {
   static const Kernels kernels = generic::table("generic");
   return kernels;

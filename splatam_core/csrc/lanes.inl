@@ -20,7 +20,7 @@ static inline Lanes load(const float* from) {
 
 static inline void store(float* to, Lanes value) { __builtin_memcpy(to, &value, sizeof value); }
 
-// exp of at most 88: 2^n times a Taylor polynomial on half an octave (relative error about 1e-7).
+// exp(x) for x up to 88: 2^n times a Taylor polynomial on half an octave (relative error about 1e-7).
 static inline Lanes exp(Lanes x) {
   x = max(x, splat(-87.0f));
   const Lanes shifter = splat(12582912.0f);  // 1.5 * 2^23: adding it rounds to a whole number
@@ -36,7 +36,7 @@ static inline Lanes exp(Lanes x) {
   return p * (Lanes)((__builtin_convertvector(n, IntLanes) + 127) << 23);
 }
 
-// An upper bound of ln x, at most 0.012 above it, for normal x.
+// Returns an upper bound of ln x, at most 0.012 above it, for normal x.
 static inline Lanes log_bound(Lanes x) {
   const IntLanes bits = (IntLanes)x;
   const Lanes exponent = __builtin_convertvector((bits >> 23) - 127, Lanes);
@@ -47,7 +47,7 @@ static inline Lanes log_bound(Lanes x) {
 
 static inline Lanes keep(IntLanes mask, Lanes a) { return mask ? a : Lanes{}; }
 
-// Two rows of eight, the upper one first: one register where the processor has such, else two.
+// Two rows of eight, the upper one first: one register if the processor has registers of that size, else two.
 #if SPLATAM_PAIRED
 typedef float Pair __attribute__((vector_size(64)));
 typedef std::int32_t IntPair __attribute__((vector_size(64)));

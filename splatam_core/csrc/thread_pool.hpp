@@ -1,6 +1,6 @@
-// A few threads that wait for work: run(task) calls task(0..size-1) on all of them and returns when all are done.
-// A render is a dozen such tasks, each shorter than it takes to wake a thread: so a thread looks out for the next one for
-// a moment before it sleeps.
+// A pool of threads: run(task) calls task(0..size-1), one index per thread, and returns when all are done. A render is
+// a dozen such tasks, each shorter than waking a thread takes. So a thread polls for the next task for 100 us before it
+// sleeps.
 #pragma once
 
 #include <atomic>
@@ -54,7 +54,7 @@ class ThreadPool {
     std::uint64_t seen = 0;
     for (;;) {
       const std::function<void(int)>* task;
-      look_out(seen);
+      poll(seen);
       {
         std::unique_lock<std::mutex> lock(mutex_);
         wake_.wait(lock, [&] { return generation_ != seen; });
@@ -67,8 +67,8 @@ class ThreadPool {
     }
   }
 
-  // Until there is a task, or the moment is over.
-  void look_out(std::uint64_t seen) const {
+  // Polls for up to 100 us until there is a new task.
+  void poll(std::uint64_t seen) const {
     const auto end = std::chrono::steady_clock::now() + std::chrono::microseconds(100);
     while (generation_.load(std::memory_order_acquire) == seen && std::chrono::steady_clock::now() < end)
       std::this_thread::yield();

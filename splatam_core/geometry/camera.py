@@ -1,4 +1,4 @@
-"""Pinhole cameras, their calibration, and turning recorded images into frames.
+"""Pinhole cameras and camera calibrations.
 
 A pixel's centre is its integer index, everywhere. Resizing by ``s`` therefore maps
 ``f' = s f`` and ``c' = (c + 0.5) s - 0.5``.
@@ -48,17 +48,17 @@ class PinholeCamera:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
     def cropped(self, width: int, height: int, left: int = 0, top: int = 0) -> PinholeCamera:
-        """The camera of a part of the image."""
+        """Returns the camera of a part of the image."""
         return PinholeCamera(width, height, self.fx, self.fy, self.cx - left, self.cy - top)
 
     def resized(self, width: int, height: int) -> PinholeCamera:
-        """The camera of the same image resampled to another size."""
+        """Returns the camera of the image resampled to another size."""
         sx, sy = width / self.width, height / self.height
         return PinholeCamera(width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
 
 
 class Intrinsics(Protocol):
-    """Whatever states a camera: a CameraInfo adapter's result, a ``camera.yaml``."""
+    """A description of a camera, such as the content of a CameraInfo message or a ``camera.yaml``."""
 
     @property
     def width(self) -> int:
@@ -95,7 +95,7 @@ class Intrinsics(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class CameraCalibration:
-    """A real camera: a pinhole and how its lens departs from one (OpenCV's coefficient order)."""
+    """A real camera: a pinhole and the distortion of its lens (coefficients in OpenCV's order)."""
 
     pinhole: PinholeCamera
     distortion_model: str = 'none'
@@ -112,12 +112,12 @@ class CameraCalibration:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether any coefficient bends a ray."""
+        """Whether any distortion coefficient is not zero."""
         return any(self.distortion)
 
     @classmethod
     def from_intrinsics(cls, intrinsics: Intrinsics) -> CameraCalibration:
-        """The calibration a camera states about itself."""
+        """Returns the calibration of a described camera."""
         i = intrinsics
         pinhole = PinholeCamera(i.width, i.height, i.fx, i.fy, i.cx, i.cy)
         return cls(pinhole, i.distortion_model, tuple(i.distortion))

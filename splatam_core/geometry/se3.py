@@ -10,7 +10,7 @@ Vector = NDArray[np.float64]
 
 
 def inverse(T: Matrix) -> Matrix:
-    """The inverse motion, exactly orthonormal again where T was. Shape [..., 4, 4]."""
+    """Returns the inverse motion [..., 4, 4]; its rotation is as orthonormal as that of T."""
     R_t = np.swapaxes(T[..., :3, :3], -1, -2)
     result = np.zeros_like(T)
     result[..., :3, :3] = R_t
@@ -20,16 +20,16 @@ def inverse(T: Matrix) -> Matrix:
 
 
 def skew(v: Vector) -> Matrix:
-    """[3, 3] with ``skew(v) @ w == cross(v, w)``."""
+    """Returns [3, 3] with ``skew(v) @ w == cross(v, w)``."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def exp(twist: Vector) -> Matrix:
-    """The motion of a twist [translation, rotation] (metres, radians) over unit time."""
+    """Returns the motion [4, 4] of a twist [6]: translation (metres), rotation (radians)."""
     rho, phi = np.asarray(twist[:3], dtype=np.float64), np.asarray(twist[3:], dtype=np.float64)
     angle = float(np.linalg.norm(phi))
     S = skew(phi)
-    if angle < 1e-5:  # series: the closed forms lose all digits here
+    if angle < 1e-5:  # series, because the closed forms lose all digits here
         a, b, c = 1.0 - angle**2 / 6, 0.5 - angle**2 / 24, 1 / 6 - angle**2 / 120
     else:
         a = np.sin(angle) / angle
@@ -42,7 +42,7 @@ def exp(twist: Vector) -> Matrix:
 
 
 def log(T: Matrix) -> Vector:
-    """The twist [translation, rotation] whose ``exp`` is T; rotation angle in [0, pi]."""
+    """Returns the twist [6], translation and rotation, whose ``exp`` is T; the rotation angle is in [0, pi]."""
     phi = rotation_vector(T[:3, :3])
     angle = float(np.linalg.norm(phi))
     S = skew(phi)
@@ -56,7 +56,7 @@ def log(T: Matrix) -> Vector:
 
 
 def rotation_vector(R: Matrix) -> Vector:
-    """Axis times angle (radians) of a rotation matrix."""
+    """Returns [3] axis times angle (radians) of a rotation matrix."""
     q = quaternion_from_rotation(R)
     sine = float(np.linalg.norm(q[1:]))
     if sine < 1e-12:
@@ -65,7 +65,7 @@ def rotation_vector(R: Matrix) -> Vector:
 
 
 def quaternion_from_rotation(R: Matrix) -> Vector:
-    """[w, x, y, z] with w >= 0 of a rotation matrix (Shepperd's choice of the largest pivot)."""
+    """Returns [w, x, y, z] with w >= 0 of a rotation matrix (Shepperd 1978: the largest pivot)."""
     trace = float(np.trace(R))
     candidates = np.array([trace, R[0, 0], R[1, 1], R[2, 2]])
     k = int(np.argmax(candidates))
@@ -84,7 +84,7 @@ def quaternion_from_rotation(R: Matrix) -> Vector:
 
 
 def rotation_from_quaternion(q: Vector) -> Matrix:
-    """[..., 3, 3] rotation of a [..., 4] quaternion (w, x, y, z) of any non-zero length."""
+    """Returns [..., 3, 3] of quaternions [..., 4] (w, x, y, z) of any non-zero length."""
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     return np.stack(
         [
@@ -97,7 +97,7 @@ def rotation_from_quaternion(q: Vector) -> Matrix:
 
 
 def compose(q: Vector, t: Vector) -> Matrix:
-    """[..., 4, 4] from quaternions (w, x, y, z) and translations."""
+    """Returns [..., 4, 4] of quaternions [..., 4] (w, x, y, z) and translations [..., 3]."""
     T = np.zeros((*np.shape(t)[:-1], 4, 4))
     T[..., :3, :3] = rotation_from_quaternion(np.asarray(q, dtype=np.float64))
     T[..., :3, 3] = t
@@ -106,5 +106,5 @@ def compose(q: Vector, t: Vector) -> Matrix:
 
 
 def interpolate(T_a: Matrix, T_b: Matrix, fraction: float) -> Matrix:
-    """The pose a fraction of the way along the screw from a to b; beyond [0, 1] it extrapolates."""
+    """Returns the pose a fraction of the way along the screw from a to b; outside [0, 1] it extrapolates."""
     return T_a @ exp(fraction * log(inverse(T_a) @ T_b))

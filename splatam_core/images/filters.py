@@ -1,4 +1,4 @@
-"""Image filters on any device: OpenCV's on the processor, where they are the fastest, and the same in torch elsewhere."""
+"""Image filters on any device: OpenCV's on the CPU, where they are fastest, and the same in torch elsewhere."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ _SSIM_WINDOW = cv2.getGaussianKernel(11, 1.5)  # [11, 1]
 
 
 def is_on_host(tensor: Tensor) -> bool:
-    """Whether numpy and OpenCV reach it."""
+    """Returns whether numpy and OpenCV can read the tensor."""
     return tensor.device.type == 'cpu'
 
 
 def blurred(images: Tensor) -> Tensor:
-    """Images [N, H, W] convolved with SSIM's 11x11 Gaussian window, zeros outside.
+    """Convolves images [N, H, W] with SSIM's 11x11 Gaussian window; zeros outside.
 
     OpenCV's separable filter takes a hundredth of the time of torch's convolution on a CPU.
     """
@@ -27,7 +27,7 @@ def blurred(images: Tensor) -> Tensor:
 
 
 def box_sums(image: Tensor, side: int) -> Tensor:
-    """[H, W] sums over the square of an odd side around each pixel, zeros outside."""
+    """Returns [H, W] sums over a square with an odd side around each pixel; zeros outside."""
     if not is_on_host(image):
         return box_sums_by_torch(image, side)
     sums = cv2.boxFilter(image.numpy(), -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
@@ -35,33 +35,33 @@ def box_sums(image: Tensor, side: int) -> Tensor:
 
 
 def shrunk(rgb8: Tensor, width: int, height: int) -> Tensor:
-    """[height, width, 3] uint8 of a larger image [H, W, 3] uint8: each pixel the mean of the area it covers."""
+    """Shrinks [H, W, 3] uint8 to [height, width, 3]: each pixel is the mean of the area it covers."""
     if not is_on_host(rgb8):
         return shrunk_by_torch(rgb8, width, height)
     return torch.from_numpy(cv2.resize(rgb8.numpy(), (width, height), interpolation=cv2.INTER_AREA))
 
 
 def nearest(image: Tensor, width: int, height: int) -> Tensor:
-    """[height, width] of an image [H, W] of another size: the pixel nearest to each centre."""
+    """Resizes [H, W] to [height, width] by the nearest pixel centre."""
     if not is_on_host(image):
         return nearest_by_torch(image, width, height)
     return torch.from_numpy(cv2.resize(image.numpy(), (width, height), interpolation=cv2.INTER_NEAREST_EXACT))
 
 
-def median(values: Tensor, counts: Tensor) -> Tensor:
-    """[] of the values [H, W] that count, the lower one of two; NaN where none does."""
+def median(values: Tensor, mask: Tensor) -> Tensor:
+    """Returns [] the median of the values [H, W] under a mask, the lower one of two; NaN if the mask is empty."""
     if not is_on_host(values):
-        return median_by_torch(values, counts)
-    return torch.where(counts, values, torch.nan).nanmedian()
+        return median_by_torch(values, mask)
+    return torch.where(mask, values, torch.nan).nanmedian()
 
 
 def brightness(rgb8: Tensor) -> Tensor:
-    """[H, W] luminance in [0, 1] of 8-bit colours [H, W, 3], in torch."""
+    """Returns [H, W] luminance in [0, 1] of 8-bit colours [H, W, 3], in torch."""
     return luminance(rgb8.float()) / 255
 
 
 def luminance(rgb: Tensor) -> Tensor:
-    """[...] luminance of colours [..., 3], in torch."""
+    """Returns [...] luminance of colours [..., 3], in torch."""
     return 0.299 * rgb[..., 0] + 0.587 * rgb[..., 1] + 0.114 * rgb[..., 2]
 
 
@@ -81,7 +81,7 @@ def blurred_by_torch(images: Tensor) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _ssim_window(device: torch.device) -> Tensor:
-    """[1, 1, 11]; brought over once, for the host would wait for it every time."""
+    """Returns [1, 1, 11]. Cached, because the host waits for the transfer to the device."""
     return torch.from_numpy(_SSIM_WINDOW[:, 0]).float().view(1, 1, -1).to(device)
 
 
@@ -91,14 +91,14 @@ def box_sums_by_torch(image: Tensor, side: int) -> Tensor:
 
 
 def shrunk_by_torch(rgb8: Tensor, width: int, height: int) -> Tensor:
-    """See ``shrunk``; OpenCV rounds ties otherwise, so a colour may differ by one of its 255 steps."""
-    rows, columns = (_shares(*sizes, rgb8.device) for sizes in ((rgb8.shape[0], height), (rgb8.shape[1], width)))
+    """See ``shrunk``. OpenCV rounds ties differently, so a colour may differ by 1 of 255."""
+    rows, columns = (_overlaps(*sizes, rgb8.device) for sizes in ((rgb8.shape[0], height), (rgb8.shape[1], width)))
     image = rgb8.permute(2, 0, 1).float()  # [3, H, W]
     return (rows @ image @ columns.T).round_().clamp_(0, 255).byte().permute(1, 2, 0).contiguous()
 
 
-def _shares(size: int, new_size: int, device: torch.device) -> Tensor:
-    """[new_size, size] how much of each new pixel lies on each old one; rows sum to one."""
+def _overlaps(size: int, new_size: int, device: torch.device) -> Tensor:
+    """Returns [new_size, size] fractions of each new pixel that lie on each old one; rows sum to one."""
     step = size / new_size
     begins = torch.arange(new_size, device=device, dtype=torch.float64)[:, None] * step
     pixels = torch.arange(size, device=device, dtype=torch.float64)
@@ -106,10 +106,10 @@ def _shares(size: int, new_size: int, device: torch.device) -> Tensor:
     return (overlap.clamp_(min=0) / step).float()
 
 
-def median_by_torch(values: Tensor, counts: Tensor) -> Tensor:
-    """See ``median``. A sort, because torch's own makes the host wait for the device."""
-    ordered = torch.where(counts, values, torch.inf).flatten().sort().values
-    middle = (counts.sum() - 1).clamp_(min=0) // 2
+def median_by_torch(values: Tensor, mask: Tensor) -> Tensor:
+    """See ``median``. It sorts, because torch's own median makes the host wait for the device."""
+    ordered = torch.where(mask, values, torch.inf).flatten().sort().values
+    middle = (mask.sum() - 1).clamp_(min=0) // 2
     value = ordered.gather(0, middle[None])[0]
     return torch.where(torch.isinf(value), torch.nan, value)
 
@@ -121,11 +121,11 @@ def nearest_by_torch(image: Tensor, width: int, height: int) -> Tensor:
 
 
 def _nearest(size: int, new_size: int, device: torch.device) -> Tensor:
-    """[new_size] the old pixel nearest to each new one; of two equally near, the later."""
+    """Returns [new_size] the old pixel nearest to each new one; the later one of two equally near."""
     positions = np.floor((np.arange(new_size) + 0.5) * (size / new_size)).astype(np.int64)
     return torch.from_numpy(np.minimum(positions, size - 1)).to(device)
 
 
-def inliers(error: Tensor, counts: Tensor, ratio: float) -> Tensor:
-    """[H, W] what counts and has an error of at most so many times the median of all that count."""
-    return counts & (error <= ratio * median(error, counts))
+def inliers(error: Tensor, mask: Tensor, ratio: float) -> Tensor:
+    """Returns [H, W] the part of a mask where the error is at most ``ratio`` times its median under the mask."""
+    return mask & (error <= ratio * median(error, mask))

@@ -1,10 +1,10 @@
-"""Turn recorded images into frames of an ideal camera: rectify, register, resize."""
+"""Turns recorded images into frames of an ideal camera: rectifies, registers and resizes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -14,21 +14,23 @@ from splatam_core.errors import CameraError, FrameError
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 from splatam_core.types import RgbdFrame
 
+Value = TypeVar('Value', np.uint8, np.float32)
+
 
 @dataclass(frozen=True)
 class FrameFactory:
-    """Makes frames of one ideal camera out of one real camera's images.
+    """Makes frames of one ideal camera from the images of one real camera.
 
-    Rectifies (colour bilinear, depth nearest) and resizes (colour by area when shrinking, depth
-    nearest). Depth is measured along the optical axis, so rectification moves it but keeps its value.
+    Rectifies (colour bilinear, depth nearest) and resizes (colour by area when shrinking, depth nearest). Depth is measured
+    along the optical axis, so rectification moves readings but keeps their values.
 
     Attributes:
         calibration: the camera that took the images.
-        width: width of the frames in pixels; None keeps the recorded size. Height follows the aspect.
-        depth_camera: the ideal camera of the depth images where it is not colour's. It has the same centre
-            and axes, so that depth only moves to other pixels.
-        rectified: the ideal camera to rectify to, in the recorded size, where it is not the calibration's
-            own: frames whose cameras differ a little come out as frames of one.
+        width: width of the frames in pixels; None keeps the recorded size. The height keeps the aspect ratio.
+        depth_camera: the ideal camera of the depth images, if it differs from that of colour. It has the same centre and axes,
+            so that readings only move to other pixels.
+        rectified: the ideal camera to rectify to, in the recorded size, if it is not the calibration's own. With it, images
+            whose cameras differ slightly become frames of one camera.
     """
 
     calibration: CameraCalibration
@@ -54,7 +56,7 @@ class FrameFactory:
 
     @cached_property
     def _maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        """Where in a recorded image each rectified pixel lies: x and y, [H, W] each."""
+        """The position in a recorded image of each rectified pixel: x and y, [H, W] each; None if nothing moves."""
         calibration, pinhole = self.calibration, self._pinhole
         if not calibration.is_distorted and pinhole == calibration.pinhole:
             return None
@@ -62,14 +64,13 @@ class FrameFactory:
             cv2.fisheye.initUndistortRectifyMap if calibration.distortion_model == 'equidistant' else cv2.initUndistortRectifyMap
         )
         distortion = np.array(calibration.distortion if calibration.is_distorted else [0.0] * 4)
-        return undistort(
-            calibration.pinhole.matrix, distortion, np.eye(3), pinhole.matrix,
-            (pinhole.width, pinhole.height), cv2.CV_32FC1,
-        )  # fmt: skip
+        size = pinhole.width, pinhole.height
+        x, y = undistort(calibration.pinhole.matrix, distortion, np.eye(3), pinhole.matrix, size, cv2.CV_32FC1)
+        return np.asarray(x, np.float32), np.asarray(y, np.float32)
 
     @cached_property
     def _depth_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        """The same for depth images."""
+        """As ``_maps``, for depth images."""
         if self.depth_camera is None:
             return self._maps
         to, of = self._pinhole, self.depth_camera
@@ -79,36 +80,36 @@ class FrameFactory:
         return x, y
 
     def make(self, stamp_ns: int, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> RgbdFrame:
-        """Make one frame.
+        """Makes one frame.
 
         Args:
-            stamp_ns: time of the exposure.
+            stamp_ns: time of the exposure, nanoseconds.
             rgb: [H, W, 3] in the recorded size.
-            depth_m: metres, registered to colour; another resolution of the same view will do. 0, NaN and inf are no
-                reading. [H, W], or the size of ``depth_camera`` where there is one.
+            depth_m: [H, W] metres, registered to colour; its resolution may differ. With a ``depth_camera``, it has that
+                camera's size. 0, NaN and inf are no reading.
 
         Raises:
-            FrameError: colour has another size than the calibration, or depth another shape.
+            FrameError: colour does not have the size of the calibration, or depth not its aspect ratio or camera's size.
         """
         pinhole = self.calibration.pinhole
         if rgb.shape[:2] != (pinhole.height, pinhole.width):
             raise FrameError(
                 f'colour image is {_size(rgb)} but the camera is calibrated for {pinhole.width}x{pinhole.height}; '
-                'is the camera info that of this image?'
+                'does the camera info belong to this image?'
             )
         if self.depth_camera is None:
             depth_m = self._at_colour_size(depth_m)
         else:
             _check_depth_size(depth_m, self.depth_camera)
         if self._maps is not None:
-            rgb = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR)
+            rgb = _remapped(rgb, self._maps, cv2.INTER_LINEAR)
         if self._depth_maps is not None:
-            depth_m = cv2.remap(depth_m, *self._depth_maps, cv2.INTER_NEAREST)
+            depth_m = _remapped(depth_m, self._depth_maps, cv2.INTER_NEAREST)
         size = (self.camera.width, self.camera.height)
         if size != (self._pinhole.width, self._pinhole.height):
             shrinking = size[0] < self._pinhole.width
-            rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)
-            depth_m = _resize_nearest(depth_m, size)
+            rgb = _resized(rgb, size, cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)
+            depth_m = _resized(depth_m, size, cv2.INTER_NEAREST_EXACT)
         depth_m = kept(depth_m, (depth_m > 0) & (depth_m < np.inf))
         return RgbdFrame(stamp_ns, np.ascontiguousarray(rgb), depth_m, self.camera)
 
@@ -116,13 +117,13 @@ class FrameFactory:
         width, height = self.calibration.pinhole.width, self.calibration.pinhole.height
         if depth_m.shape == (height, width):
             return depth_m
-        if abs(depth_m.shape[0] - height * depth_m.shape[1] / width) >= 1:  # a row: halving an odd size rounds
+        if abs(depth_m.shape[0] - height * depth_m.shape[1] / width) >= 1:  # one row: halving an odd size rounds
             raise FrameError(
-                f'depth image is {_size(depth_m)}, which is no other resolution of a {width}x{height} colour image, so '
-                'it is not registered to it; use the depth that the driver aligns to colour, with RealSense '
-                'aligned_depth_to_color, with Azure Kinect depth_to_rgb'
+                f'depth image is {_size(depth_m)}, which does not have the aspect ratio of the {width}x{height} colour image, so '
+                'it is not registered to it; use the depth that the driver aligns to colour (RealSense: '
+                'aligned_depth_to_color, Azure Kinect: depth_to_rgb)'
             )
-        return _resize_nearest(depth_m, (width, height))
+        return _resized(depth_m, (width, height), cv2.INTER_NEAREST_EXACT)
 
 
 def _size(image: NDArray[Any]) -> str:
@@ -135,12 +136,16 @@ def _check_depth_size(depth_m: NDArray[np.float32], camera: PinholeCamera) -> No
 
 
 def kept(depth_m: NDArray[np.floating[Any]], chosen: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """[H, W] the readings that are chosen, 0 elsewhere; three times as fast as ``np.where``."""
+    """Returns [H, W] the chosen readings, 0 elsewhere; three times as fast as ``np.where``."""
     readings = np.zeros(depth_m.shape, np.float32)
     np.copyto(readings, depth_m, where=chosen, casting='same_kind')
     return readings
 
 
-def _resize_nearest(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """Nearest by pixel centres; cv2.INTER_NEAREST rounds the corner instead and shifts by half a pixel."""
-    return cv2.resize(image, size, interpolation=cv2.INTER_NEAREST_EXACT)
+def _resized(image: NDArray[Value], size: tuple[int, int], interpolation: int) -> NDArray[Value]:
+    """Resizes to (width, height). INTER_NEAREST_EXACT is by pixel centres; INTER_NEAREST would shift by half a pixel."""
+    return np.asarray(cv2.resize(image, size, interpolation=interpolation), image.dtype)
+
+
+def _remapped(image: NDArray[Value], maps: tuple[NDArray[np.float32], NDArray[np.float32]], interpolation: int) -> NDArray[Value]:
+    return np.asarray(cv2.remap(image, *maps, interpolation), image.dtype)

@@ -11,7 +11,7 @@ from splatam_core.images.filters import blurred
 
 
 def ssim_map(a: Tensor, b: Tensor) -> Tensor:
-    """Structural similarity per pixel and channel (Wang et al. 2004), zero-padded 11x11 Gaussian window.
+    """Returns the structural similarity per pixel and channel, with a zero-padded 11x11 Gaussian window.
 
     Args:
         a: [3, H, W] in [0, 1].
@@ -25,7 +25,7 @@ def ssim_map(a: Tensor, b: Tensor) -> Tensor:
 
 
 def ssim_terms(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """The two factors of ``ssim_map``: luminance, and contrast times structure."""
+    """Returns the two factors of ``ssim_map``: luminance, and contrast times structure."""
     c1, c2 = 0.01**2, 0.03**2
     mean_a, mean_b, aa, bb, ab = map(_Blur.apply, (a, b, a * a, b * b, a * b))
     variances = aa - mean_a**2 + bb - mean_b**2
@@ -34,12 +34,12 @@ def ssim_terms(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _Blur(torch.autograd.Function):
-    """Images [N, H, W] convolved with the SSIM window, zeros outside; symmetric, so it is its own adjoint."""
+    """Convolves images [N, H, W] with the SSIM window; zeros outside. It is symmetric, and so its own adjoint."""
 
     @staticmethod
     def forward(ctx: Any, images: Tensor) -> Tensor:
         return blurred(images.detach())
 
     @staticmethod
-    def backward(ctx: Any, slopes: Tensor) -> Tensor:
-        return blurred(slopes)
+    def backward(ctx: Any, gradients: Tensor) -> Tensor:
+        return blurred(gradients)

@@ -14,20 +14,24 @@ __all__ = [
 
 
 def make_rasterizer(name: str, threads: int = 0) -> Rasterizer:
-    """A backend by its name.
+    """Returns a backend by its name.
 
     Args:
-        name: ``cpu``, ``reference`` or ``triton``; what the configuration's ``auto`` means, ``rasterizer_for`` knows.
-        threads: CPU threads of ``cpu``; 0 = all cores.
+        name: ``cpu``, ``reference`` or ``triton``; ``rasterizer_for`` resolves the configuration's ``auto``.
+        threads: CPU threads of ``cpu``; 0 = one per core.
+
+    Raises:
+        RasterizerError: what the backend needs is not installed.
     """
     return _BACKENDS[name](threads)
 
 
 def rasterizer_for(config: SlamConfig) -> tuple[Rasterizer, torch.device]:
-    """What draws maps by a configuration, and where they have to be.
+    """Returns the rasterizer of a configuration, and the device on which maps must be.
 
     Raises:
-        ConfigError: it asks for what is not there.
+        ConfigError: the device or rasterizer is not available on this machine.
+        RasterizerError: what the rasterizer needs is not installed.
     """
     backend = choose_backend(config)
     return make_rasterizer(backend.rasterizer, config.threads), backend.device

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -22,34 +22,31 @@ from splatam_core.rasterizer.base import (
     Target,
     check_isotropic,
 )
-from splatam_core.rasterizer.bounds import BLOCK
 from splatam_core.rasterizer.ewa import Ellipses, project
+from splatam_core.rasterizer.native import make_blender, make_engine
 
-try:
+if TYPE_CHECKING:
     from splatam_core import _native
-except ImportError as error:
-    raise RasterizerError(
-        f"the CPU rasterizer's native module cannot be loaded ({error}); build it with 'pip install .' "
-        "(needs g++ and Python's headers), or use rasterizer=reference"
-    ) from None
-if _native.BLOCK != BLOCK:
-    raise RasterizerError("the CPU rasterizer's native module is of another version: build it anew with 'pip install .'")
 
 
 class CpuRasterizer:
     """Sorted, tiled, vectorised and threaded.
 
-    With a fixed number of threads results are repeatable bit for bit; images do not depend on it at all.
+    With a fixed number of threads results are repeatable bit for bit; images do not depend on the number.
     """
 
     def __init__(self, threads: int = 0) -> None:
-        threads = threads or len(os.sched_getaffinity(0))
-        self._engine = _native.Engine(threads)
-        self._blender = _native.Blender(threads)  # of anisotropic Gaussians
+        """Starts the threads; 0 = one per core.
+
+        Raises:
+            RasterizerError: the native extension is missing.
+        """
+        self._engine = make_engine(threads)
+        self._blender = make_blender(threads)  # of anisotropic Gaussians
 
     @property
     def instruction_set(self) -> str:
-        """The variant of the kernels this processor got."""
+        """The instruction set of the kernels that this processor runs."""
         return self._engine.instruction_set
 
     def render(self, gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -> Render:
@@ -57,13 +54,11 @@ class CpuRasterizer:
         _check(gaussians, T_cam_world)
         if gaussians.rotations is not None:
             return self._render_ellipses(project(gaussians, camera, T_cam_world), camera)
-        return Render(
-            *_Splat.apply(
-                gaussians.means.contiguous(), gaussians.log_scales.contiguous(),
-                gaussians.logit_opacities.contiguous(), gaussians.rgb.contiguous(), T_cam_world, gaussians.bounds,
-                self._engine, camera,
-            )
+        images = _Splat.apply(
+            gaussians.means.contiguous(), gaussians.log_scales.contiguous(), gaussians.logit_opacities.contiguous(),
+            gaussians.rgb.contiguous(), T_cam_world, _Pass(self._engine, camera, gaussians.bounds),
         )  # fmt: skip
+        return Render(*images)
 
     def _render_ellipses(self, ellipses: Ellipses, camera: PinholeCamera) -> Render:
         shapes = torch.cat([ellipses.centers, ellipses.conics, ellipses.opacities[:, None]], dim=1)
@@ -71,18 +66,35 @@ class CpuRasterizer:
         return Render(image[:3], image[3], image[4])
 
     def fit(self, gaussians: Gaussians, moments: Moments, rates: Rates, target: Target) -> float:
-        """See ``Rasterizer.fit``. One native call: nothing of it passes through autograd."""
+        """See ``Rasterizer.fit``. One native call, without autograd."""
         check_isotropic(gaussians)
         _check(gaussians, target.T_cam_world)
         camera, readings = target.camera, max(1, int(torch.count_nonzero(target.depth)))
         return self._engine.fit(
-            gaussians.means.numpy(), gaussians.log_scales.numpy(), gaussians.logit_opacities.numpy(),
-            gaussians.rgb.numpy(), _array(gaussians.bounds), moments.first_second.numpy(), moments.steps.numpy(),
-            (rates.means, rates.log_scales, rates.logit_opacities, rates.rgb), target.T_cam_world.numpy(),
-            camera.fx, camera.fy, camera.cx, camera.cy, target.rgb8.numpy(), target.depth.numpy(),
-            target.color_weight / (3 * camera.width * camera.height), target.depth_weight / readings,
-            COLOR_LIMIT, DEPTH_LIMIT_M,
-        )  # fmt: skip
+            **_arrays(gaussians),
+            moments=moments.first_second.numpy(),
+            steps=moments.steps.numpy(),
+            rates=(rates.means, rates.log_scales, rates.logit_opacities, rates.rgb),
+            T_cam_world=target.T_cam_world.numpy(),
+            camera=camera,
+            target_rgb=target.rgb8.numpy(),
+            target_depth=target.depth.numpy(),
+            color_weight=target.color_weight / (3 * camera.width * camera.height),
+            depth_weight=target.depth_weight / readings,
+            color_limit=COLOR_LIMIT,
+            depth_limit=DEPTH_LIMIT_M,
+        )
+
+
+def _arrays(gaussians: Gaussians) -> dict[str, Any]:
+    """Returns the isotropic Gaussians as the engine takes them."""
+    return {
+        'means': gaussians.means.numpy(),
+        'log_scales': gaussians.log_scales.numpy(),
+        'logit_opacities': gaussians.logit_opacities.numpy(),
+        'rgb': gaussians.rgb.numpy(),
+        'bounds': _array(gaussians.bounds),
+    }
 
 
 def _array(tensor: Tensor | None) -> NDArray[np.float32] | None:
@@ -90,8 +102,13 @@ def _array(tensor: Tensor | None) -> NDArray[np.float32] | None:
 
 
 def _check(gaussians: Gaussians, T_cam_world: Tensor) -> None:
+    """Checks shapes, types and devices.
+
+    Raises:
+        RasterizerError: a tensor is not what the native code takes.
+    """
     n = len(gaussians)
-    expected = {'means': (n, 3), 'log_scales': (n, 1), 'logit_opacities': (n,), 'rgb': (n, 3)}
+    expected: dict[str, tuple[int, ...]] = {'means': (n, 3), 'log_scales': (n, 1), 'logit_opacities': (n,), 'rgb': (n, 3)}
     if gaussians.rotations is not None:
         expected |= {'log_scales': (n, 3), 'rotations': (n, 4)}
     tensors = {name: getattr(gaussians, name) for name in expected} | {'T_cam_world': T_cam_world}
@@ -104,49 +121,71 @@ def _check(gaussians: Gaussians, T_cam_world: Tensor) -> None:
             )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pass:
+    """What a forward pass needs that gets no gradient.
+
+    Attributes:
+        engine: renders.
+        camera: the image to draw.
+        bounds: see ``Gaussians.bounds``.
+    """
+
+    engine: _native.Engine
+    camera: PinholeCamera
+    bounds: Tensor | None
+
+
 class _Splat(torch.autograd.Function):
+    """Isotropic Gaussians and a pose to colour, depth_acc and silhouette."""
+
     @staticmethod
     def forward(
-        ctx: Any,
-        means: Tensor,
-        log_scales: Tensor,
-        logit_opacities: Tensor,
-        rgb: Tensor,
-        T_cam_world: Tensor,
-        bounds: Tensor | None,
-        engine: _native.Engine,
-        camera: PinholeCamera,
+        ctx: Any, means: Tensor, log_scales: Tensor, logit_opacities: Tensor, rgb: Tensor, T_cam_world: Tensor, given: _Pass
     ) -> tuple[Tensor, Tensor, Tensor]:
-        size = (camera.height, camera.width)
+        size = given.camera.height, given.camera.width
         images = torch.empty(3, *size), torch.empty(size), torch.empty(size)
-        inputs = means, log_scales, logit_opacities, rgb
-        ctx.view = engine.forward(
-            *(tensor.detach().numpy() for tensor in inputs), T_cam_world.detach().numpy(),
-            camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, _array(bounds),
-            *(image.numpy() for image in images),
-        )  # fmt: skip
-        ctx.engine = engine
-        ctx.save_for_backward(*inputs, *images)
+        gaussians = Gaussians(means, log_scales, logit_opacities, rgb, given.bounds)
+        ctx.view = given.engine.forward(
+            **_arrays(gaussians.detached()),
+            T_cam_world=T_cam_world.detach().numpy(),
+            camera=given.camera,
+            image=images[0].numpy(),
+            depth=images[1].numpy(),
+            silhouette=images[2].numpy(),
+        )
+        ctx.engine = given.engine
+        ctx.save_for_backward(means, log_scales, logit_opacities, rgb, *images)
         return images
 
     @staticmethod
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
-        *inputs, rgb_image, depth_acc, silhouette = ctx.saved_tensors
+    def backward(ctx: Any, *image_gradients: Tensor) -> tuple[Tensor | None, ...]:
+        *inputs, rgb_image, depth_acc, silhouette = (tensor.detach() for tensor in ctx.saved_tensors)
+        means, log_scales, logit_opacities, rgb = inputs
         gradients = [
             torch.zeros_like(tensor) if wanted else None for tensor, wanted in zip(inputs, ctx.needs_input_grad, strict=False)
         ]
-        pose = torch.zeros(4, 4)
+        by_means, by_log_scales, by_logit_opacities, by_rgb = map(_array, gradients)
+        by_pose = torch.zeros(4, 4)
         ctx.engine.backward(
-            ctx.view, *(tensor.detach().numpy() for tensor in inputs),
-            [image.detach().numpy() for image in (rgb_image, depth_acc, silhouette)],
-            [slope.contiguous().numpy() for slope in slopes],
-            *(None if gradient is None else gradient.numpy() for gradient in gradients), pose.numpy(),
-        )  # fmt: skip
-        return *gradients, pose if ctx.needs_input_grad[4] else None, None, None, None
+            ctx.view,
+            means=means.numpy(),
+            log_scales=log_scales.numpy(),
+            logit_opacities=logit_opacities.numpy(),
+            rgb=rgb.numpy(),
+            images=[image.numpy() for image in (rgb_image, depth_acc, silhouette)],
+            image_gradients=[gradient.contiguous().numpy() for gradient in image_gradients],
+            means_gradient=by_means,
+            log_scales_gradient=by_log_scales,
+            logit_opacities_gradient=by_logit_opacities,
+            rgb_gradient=by_rgb,
+            pose_gradient=by_pose.numpy(),
+        )
+        return *gradients, by_pose if ctx.needs_input_grad[4] else None, None
 
 
 class _Blend(torch.autograd.Function):
-    """Sorted ellipses blended into [5, H, W]: colour, depth_acc, silhouette."""
+    """Sorted ellipses, blended to [5, H, W]: colour, depth_acc, silhouette."""
 
     @staticmethod
     def forward(ctx: Any, shapes: Tensor, features: Tensor, blender: _native.Blender, camera: PinholeCamera) -> Tensor:
@@ -157,11 +196,16 @@ class _Blend(torch.autograd.Function):
         return image
 
     @staticmethod
-    def backward(ctx: Any, slopes: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, image_gradient: Tensor) -> tuple[Tensor | None, ...]:
         shapes, features, image = (tensor.detach() for tensor in ctx.saved_tensors)
         by_shapes, by_features = torch.empty_like(shapes), torch.empty_like(features)
         ctx.blender.backward(
-            ctx.lists, shapes.numpy(), features.numpy(), image.numpy(), slopes.contiguous().numpy(),
-            by_shapes.numpy(), by_features.numpy(),
-        )  # fmt: skip
+            ctx.lists,
+            shapes=shapes.numpy(),
+            features=features.numpy(),
+            image=image.numpy(),
+            image_gradient=image_gradient.contiguous().numpy(),
+            shapes_gradient=by_shapes.numpy(),
+            features_gradient=by_features.numpy(),
+        )
         return by_shapes, by_features, None, None

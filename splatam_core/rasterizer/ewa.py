@@ -1,4 +1,4 @@
-"""Anisotropic Gaussians on the image: elliptical weighted averages (Zwicker et al., "EWA splatting", 2002)."""
+"""Projection of anisotropic Gaussians to ellipses (Zwicker et al., "EWA splatting", 2002)."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from torch import Tensor
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.rasterizer.base import BLUR_PX2, NEAR_M, Gaussians
 
-MARGIN = 0.15  # of the image's size: beyond it the projection's slope is held, where it would run off
+MARGIN = 0.15
+"""Fraction of the image's size around it, beyond which the Jacobian of the projection is held constant: it would diverge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ellipses:
-    """Gaussians as they lie on the image, K of them, front to back.
+    """K projected Gaussians, front to back.
 
     Attributes:
-        centers: [K, 2] u, v.
+        centers: [K, 2] u, v in pixels.
         conics: [K, 3] inverse covariance, xx xy yy, px^-2.
         opacities: [K].
         features: [K, 4] rgb and z.
@@ -31,7 +32,7 @@ class Ellipses:
 
 
 def project(gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -> Ellipses:
-    """Bring anisotropic Gaussians onto the image, differentiably in them and in the pose, in any precision."""
+    """Projects anisotropic Gaussians, differentiable in them and in the pose, in any precision."""
     assert gaussians.rotations is not None
     points = gaussians.means @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]  # [N, 3]
     drawn = torch.nonzero((points.detach()[:, 2] > NEAR_M) & torch.isfinite(points.detach()).all(dim=1))[:, 0]
@@ -40,8 +41,8 @@ def project(gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) ->
     x, y, z = points.unbind(-1)
     centers = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=1)
     axes = rotations(gaussians.rotations[drawn]) * gaussians.log_scales[drawn].exp()[:, None, :]  # [K, 3, 3] columns
-    slopes = _slopes(points, camera) @ T_cam_world[:3, :3]  # [K, 2, 3] pixels per metre in the world
-    on_image = (slopes[:, :, :, None] * axes[:, None]).sum(dim=2)  # [K, 2, 3]; bmm is far slower on so small matrices
+    jacobian = _jacobian(points, camera) @ T_cam_world[:3, :3]  # [K, 2, 3] pixels per metre in the world
+    on_image = (jacobian[:, :, :, None] * axes[:, None]).sum(dim=2)  # [K, 2, 3]; bmm is far slower on such small matrices
     xx, yy = ((on_image**2).sum(dim=2) + BLUR_PX2).unbind(1)
     xy = (on_image[:, 0] * on_image[:, 1]).sum(dim=1)
     conics = torch.stack([yy, -xy, xx], dim=1) / (xx * yy - xy**2)[:, None]
@@ -49,23 +50,23 @@ def project(gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) ->
     return Ellipses(centers, conics, torch.sigmoid(gaussians.logit_opacities[drawn]), features)
 
 
-def _slopes(points: Tensor, camera: PinholeCamera) -> Tensor:
-    """[K, 2, 3] how pixels move with camera coordinates, at points [K, 3]."""
+def _jacobian(points: Tensor, camera: PinholeCamera) -> Tensor:
+    """Returns [K, 2, 3] derivatives of the pixel by camera coordinates, at points [K, 3]."""
     x, y, z = points.unbind(-1)
-    x_z, y_z = _within(x / z, camera.width, camera.fx, camera.cx), _within(y / z, camera.height, camera.fy, camera.cy)
+    x_z, y_z = _clamped(x / z, camera.width, camera.fx, camera.cx), _clamped(y / z, camera.height, camera.fy, camera.cy)
     zero = torch.zeros_like(z)
     u_row = torch.stack([camera.fx / z, zero, -camera.fx * x_z / z], dim=1)
     v_row = torch.stack([zero, camera.fy / z, -camera.fy * y_z / z], dim=1)
     return torch.stack([u_row, v_row], dim=1)
 
 
-def _within(ratio: Tensor, size: int, focal: float, center: float) -> Tensor:
+def _clamped(ratio: Tensor, size: int, focal: float, center: float) -> Tensor:
     margin = MARGIN * size
     return ratio.clamp((-margin - center) / focal, (size + margin - center) / focal)
 
 
 def rotations(quaternions: Tensor) -> Tensor:
-    """[K, 3, 3] of quaternions [K, 4] (w, x, y, z) of any length but zero."""
+    """Returns [K, 3, 3] of quaternions [K, 4] (w, x, y, z) of any non-zero length."""
     w, x, y, z = (quaternions / quaternions.norm(dim=1, keepdim=True)).unbind(1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),

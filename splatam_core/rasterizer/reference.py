@@ -1,4 +1,4 @@
-"""The contract in plain torch: slow, differentiated by autograd, in any precision. The truth for the others."""
+"""The contract in plain torch: slow, differentiated by autograd, in any precision. Every other backend is tested against it."""
 
 from __future__ import annotations
 
@@ -24,18 +24,19 @@ from splatam_core.rasterizer.base import (
     Target,
     check_isotropic,
 )
-from splatam_core.rasterizer.ewa import Ellipses, project
+from splatam_core.rasterizer.ewa import Ellipses
+from splatam_core.rasterizer.ewa import project as project_anisotropic
 
 _MAX_CELLS = 20_000_000  # Gaussian-pixel pairs held at once
 
 
 class ReferenceRasterizer:
-    """Every Gaussian against every pixel."""
+    """Evaluates every Gaussian at every pixel."""
 
     def render(self, gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -> Render:
         """See ``Rasterizer.render``."""
-        on_image = _circles if gaussians.rotations is None else project
-        ellipses = on_image(gaussians, camera, T_cam_world)
+        project = _project_isotropic if gaussians.rotations is None else project_anisotropic
+        ellipses = project(gaussians, camera, T_cam_world)
         z = ellipses.features[:, 3:]
         features = torch.cat([ellipses.features, torch.ones_like(z)], dim=1)  # [K, 5]
         columns = torch.arange(camera.width, dtype=z.dtype, device=z.device)
@@ -81,8 +82,8 @@ def _huber(residual: Tensor, limit: float) -> Tensor:
     return torch.where(size <= limit, residual**2 / (2 * limit), size - limit / 2)
 
 
-def _circles(gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -> Ellipses:
-    """Isotropic Gaussians on the image, front to back."""
+def _project_isotropic(gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -> Ellipses:
+    """Projects isotropic Gaussians to circles, front to back."""
     points = gaussians.means @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]  # [N, 3]
     drawn = torch.nonzero(points[:, 2].detach() > NEAR_M)[:, 0]
     drawn = drawn[torch.sort(points[drawn, 2].detach(), stable=True).indices]  # [K]
@@ -96,7 +97,7 @@ def _circles(gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -
 
 
 def _blend(ellipses: Ellipses, features: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
-    """[5, R, W]: the features [K, 5] of sorted ellipses blended over a band of R rows."""
+    """Returns [5, R, W]: the features [K, 5] of sorted ellipses, blended over a band of R rows."""
     dx = columns - ellipses.centers[:, 0, None, None]  # [K, 1, W]
     dy = rows[:, None] - ellipses.centers[:, 1, None, None]  # [K, R, 1]
     xx, xy, yy = (entry[:, None, None] for entry in ellipses.conics.unbind(1))

@@ -1,6 +1,8 @@
-"""Trackers: (frame, map, first guess of the pose) in, pose and how far to trust it out."""
+"""Trackers find the pose of a frame in the map, from a predicted pose, with the evidence for it."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 
@@ -17,19 +19,19 @@ __all__ = [
     'AlignmentTracker', 'NullTracker', 'RenderAndCompareTracker', 'TorchAligner', 'Tracker', 'TrackingResult', 'make_tracker',
 ]  # fmt: skip
 
-_TRACKERS = {
+_TRACKERS: dict[str, Callable[[Rasterizer, TrackingConfig, int, torch.device], Tracker]] = {
     'render_and_compare': RenderAndCompareTracker, 'align': AlignmentTracker,
-    'none': NullTracker, 'truth': NullTracker,  # which Slam hands the true pose as its first guess
+    'none': NullTracker, 'truth': NullTracker,  # with truth, the predicted pose is the true one
 }  # fmt: skip
 
 
 def make_tracker(rasterizer: Rasterizer, config: TrackingConfig, threads: int = 0, device: torch.device = HOST) -> Tracker:
-    """The tracker that the configuration names.
+    """Returns the tracker that the configuration names.
 
     Args:
-        rasterizer: draws the map.
-        config: what to do.
-        threads: CPU threads; 0 = all cores.
-        device: where map and frames are.
+        rasterizer: renders the map.
+        config: the settings.
+        threads: CPU threads; 0 = one per core.
+        device: the device of map and frames.
     """
     return _TRACKERS[config.method](rasterizer, config, threads, device)

@@ -1,38 +1,36 @@
-"""A start for alignment where the prediction is poor: the frame's features, found again in a render of the map.
+"""A start for alignment where the predicted pose is poor: features of the frame, matched with a render of the map.
 
-Alignment follows slopes, so it must begin within a few pixels of the truth. Features (ORB, Rublee et al. 2011) are matched
-however far they have moved, and those of the render have depth: the pose follows (EPnP, Lepetit et al. 2009, in RANSAC),
-to some pixels, from where alignment goes on. OpenCV does all of it.
+Alignment follows image gradients, so it must start within a few pixels of the true pose. Features (ORB, Rublee et al. 2011)
+are matched however far they have moved, and those of the render have depth. The pose follows from them (EPnP, Lepetit et al.
+2009, in RANSAC) to within some pixels, close enough for alignment. All of it is OpenCV's.
 """
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Render
 
-Matrix = NDArray[np.float64]
-
 _NUM_FEATURES = 1000
-_FAST_THRESHOLD = 7  # of 255; OpenCV's 20 finds little in a blurred frame
+_FAST_THRESHOLD = 7  # of 255; the default, 20, finds little in a blurred frame
 _MIN_SILHOUETTE = 0.9
-_LARGEST_ERROR = 0.0125  # of the width: 4 pixels of 320
+_LARGEST_ERROR = 0.0125  # reprojection error of an inlier, as a fraction of the width: 4 pixels of 320
 _RANSAC_ROUNDS = 300
 _MIN_POINTS = 8
 
 
 def pose_by_features(render: Render, view: View) -> Matrix | None:
-    """Where the frame was taken from, by what it has in common with a render.
+    """Finds the pose of a frame by the features it has in common with a render.
 
     Args:
-        render: of the map, through the frame's camera.
+        render: the map, with the frame's camera.
         view: the frame.
 
     Returns:
-        [4, 4] from the render's camera to the frame's; None where too few features agree on one.
+        [4, 4] from the render's camera to the frame's; None if too few features agree on one.
     """
     points, pixels = _matches(render, view)
     if len(points) < _MIN_POINTS:
@@ -49,19 +47,19 @@ def pose_by_features(render: Render, view: View) -> Matrix | None:
 
 
 def _matches(render: Render, view: View) -> tuple[Matrix, Matrix]:
-    """[K, 3] points in the render's camera, [K, 2] the frame's pixels that look like them."""
-    orb = cv2.ORB_create(_NUM_FEATURES, fastThreshold=_FAST_THRESHOLD)
+    """Returns [K, 3] points in the render's camera and [K, 2] the pixels of the frame that match them."""
+    orb = cv2.ORB.create(_NUM_FEATURES, fastThreshold=_FAST_THRESHOLD)
     drawn = render.rgb.permute(1, 2, 0).mul(255).round().clamp(0, 255).byte().numpy(force=True)
-    (there, of_render), (here, of_frame) = (
+    (render_keypoints, render_descriptors), (frame_keypoints, frame_descriptors) = (
         orb.detectAndCompute(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), None) for rgb in (drawn, view.rgb8.numpy(force=True))
     )
-    if of_render is None or of_frame is None:
+    if render_descriptors is None or frame_descriptors is None:
         return np.empty((0, 3)), np.empty((0, 2))
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(of_render, of_frame)
-    in_render = np.array([there[pair.queryIdx].pt for pair in pairs]).reshape(-1, 2)
-    in_frame = np.array([here[pair.trainIdx].pt for pair in pairs]).reshape(-1, 2)
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(render_descriptors, frame_descriptors)
+    in_render = np.array([render_keypoints[pair.queryIdx].pt for pair in pairs]).reshape(-1, 2)
+    in_frame = np.array([frame_keypoints[pair.trainIdx].pt for pair in pairs]).reshape(-1, 2)
     u, v = in_render.round().astype(int).T
-    z, is_map = render.depth().numpy(force=True)[v, u], render.silhouette.numpy(force=True)[v, u] > _MIN_SILHOUETTE
+    z, is_opaque = render.depth().numpy(force=True)[v, u], render.silhouette.numpy(force=True)[v, u] > _MIN_SILHOUETTE
     camera = view.camera
     x, y = (in_render[:, 0] - camera.cx) / camera.fx * z, (in_render[:, 1] - camera.cy) / camera.fy * z
-    return np.stack([x, y, z], axis=1).astype(np.float64)[is_map], in_frame[is_map]
+    return np.stack([x, y, z], axis=1).astype(np.float64)[is_opaque], in_frame[is_opaque]

@@ -14,12 +14,12 @@ from splatam_core.rasterizer import Render
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackingLoss:
-    """How far a pose is from explaining a view.
+    """The loss of a pose.
 
     Attributes:
-        total: sum over the pixels that count, differentiable.
-        depth: the part of depth, unweighted, metres times pixels.
-        num_pixels: how many count, a scalar on the device.
+        total: weighted sum over the pixels compared, differentiable.
+        depth: the unweighted sum of depth errors, metres times pixels; detached.
+        num_pixels: number of pixels compared, a scalar on the device.
     """
 
     total: Tensor
@@ -28,9 +28,9 @@ class TrackingLoss:
 
 
 def tracking_loss(render: Render, view: View, config: TrackingConfig) -> TrackingLoss:
-    """Summed L1 of depth and colour where the map is sure and the sensor has a reading (paper, eq. 8).
+    """Returns the summed L1 errors of depth and colour where the map is opaque and the sensor has a reading (paper, eq. 8).
 
-    Without the silhouette's mask depth counts at every reading, and colour at every pixel, map or not.
+    Without ``use_silhouette``, depth is compared at every reading, and colour at every pixel, whether the map is there or not.
     """
     counts = view.valid & (render.silhouette.detach() > config.silhouette_threshold) if config.paper.use_silhouette else view.valid
     error = ((render.depth_acc if config.paper.blended_depth else expected_depth(render)) - view.depth).abs()
@@ -44,5 +44,5 @@ def tracking_loss(render: Render, view: View, config: TrackingConfig) -> Trackin
 
 
 def expected_depth(render: Render) -> Tensor:
-    """[H, W] metres; where little or no map is seen it fades to 0, differentiably."""
+    """Returns [H, W] metres, differentiable; below a silhouette of one half it falls to 0."""
     return render.depth_acc / render.silhouette.clamp(min=0.5)

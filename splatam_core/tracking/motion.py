@@ -1,4 +1,4 @@
-"""Where the camera probably is now."""
+"""Predicts where the camera is when a frame arrives."""
 
 from __future__ import annotations
 
@@ -6,23 +6,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatam_core.geometry import se3
+from splatam_core.geometry.se3 import Matrix
 
-Matrix = NDArray[np.float64]
-# Pose [4, 4] of the camera at the second stamp (ns) in the camera at the first, by another sensor; None: not known.
 MotionPrior = Callable[[int, int], 'Matrix | None']
-CARRIED_ON = 5  # times the interval a velocity was seen over: after a longer gap nobody knows what the camera did meanwhile
+"""Pose [4, 4] of the camera at the second stamp (ns) in the camera at the first, by another sensor; None = not known."""
+
+MAX_EXTRAPOLATION = 5
+"""A velocity is extrapolated for at most this many times the interval it was observed over: longer gaps say nothing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionState:
-    """What a motion model knows.
+    """The state of a motion model.
 
     Attributes:
-        stamp_ns: of the last pose; 0 = at any time.
-        interval_ns: over which the velocity was seen.
+        stamp_ns: of the last pose; 0 = the next pose may have any stamp.
+        interval_ns: over which the velocity was observed.
         T_world_cam: [4, 4] the last pose.
         velocity: [6] twist per second, in the camera's frame.
     """
@@ -34,10 +35,10 @@ class MotionState:
 
 
 class MotionModel:
-    """Asks another sensor how the camera moved; else carries its last motion on, by stamps: gaps may differ.
+    """Predicts by another sensor if there is one, else extrapolates the last velocity, by stamps: frames may be missing.
 
     Args:
-        constant_velocity: whether to carry motion on, or stay at the last pose.
+        constant_velocity: whether to extrapolate the velocity; else the prediction is the last pose.
         prior: the other sensor.
     """
 
@@ -55,14 +56,14 @@ class MotionModel:
         return self._T_world_cam
 
     def state(self) -> MotionState:
-        """All it knows; ``restore`` takes it back."""
+        """Returns the state, for ``restore``."""
         return MotionState(self._stamp_ns, self._interval_ns, self._T_world_cam, self._velocity)
 
     def restore(self, state: MotionState) -> None:
-        """Know what another one knew.
+        """Sets the state to that of another motion model.
 
         Raises:
-            ValueError: that is no pose and velocity.
+            ValueError: pose or velocity has the wrong shape.
         """
         if state.T_world_cam.shape != (4, 4) or state.velocity.shape != (6,):
             shapes = f'pose {state.T_world_cam.shape} and velocity {state.velocity.shape}'
@@ -71,14 +72,14 @@ class MotionModel:
         self._T_world_cam, self._velocity = state.T_world_cam, state.velocity
 
     def predict(self, stamp_ns: int) -> Matrix:
-        """[4, 4] camera to world at a stamp."""
+        """Returns the predicted pose [4, 4], camera to world, at a stamp."""
         if self._prior and self._stamp_ns and (step := self._prior(self._stamp_ns, stamp_ns)) is not None:
             return self._T_world_cam @ step
-        elapsed_ns = min(stamp_ns - self._stamp_ns, CARRIED_ON * self._interval_ns)
+        elapsed_ns = min(stamp_ns - self._stamp_ns, MAX_EXTRAPOLATION * self._interval_ns)
         return self._T_world_cam @ se3.exp(self._velocity * elapsed_ns * 1e-9)
 
     def observe(self, stamp_ns: int, T_world_cam: Matrix) -> None:
-        """Learn where the camera was."""
+        """Records the pose of a frame."""
         if self._constant_velocity and self._stamp_ns:
             step = se3.log(se3.inverse(self._T_world_cam) @ T_world_cam)
             self._interval_ns = stamp_ns - self._stamp_ns
@@ -86,10 +87,10 @@ class MotionModel:
         self._stamp_ns, self._T_world_cam = stamp_ns, T_world_cam
 
     def place(self, T_world_cam: Matrix) -> None:
-        """Be at a pose, at rest, whatever the time: the next stamp may be any."""
+        """Sets the pose, at rest; the next frame may have any stamp."""
         self.stop()
         self._stamp_ns, self._T_world_cam = 0, T_world_cam
 
     def stop(self) -> None:
-        """Forget the velocity: nobody knows how a lost camera moves."""
+        """Sets the velocity to zero, because the motion of a lost camera is not known."""
         self._velocity = np.zeros(6)

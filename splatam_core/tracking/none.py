@@ -1,19 +1,20 @@
-"""No tracking: the camera is where it was expected to be."""
+"""No tracking: the predicted pose is the result."""
 
 from __future__ import annotations
 
 import torch
 
 from splatam_core.config import TrackingConfig
+from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians, Rasterizer
-from splatam_core.tracking.base import Matrix, TrackingResult
+from splatam_core.tracking.base import TrackingResult
 
 
 class NullTracker:
-    """Believes the first guess, whatever the frame shows; never lost.
+    """Returns the predicted pose without looking at the frame; never lost.
 
-    For measuring what is around the core, and for mapping along poses that come from elsewhere.
+    For mapping along given poses, and for measuring everything but tracking.
     """
 
     def __init__(self, rasterizer: Rasterizer, config: TrackingConfig, threads: int, device: torch.device) -> None:

@@ -1,26 +1,26 @@
-"""The paper's tracker (section 3.2): Adam on the pose, through the renderer, where the silhouette is sure."""
+"""The paper's tracker (section 3.2): Adam on the pose, through the renderer, where the map is opaque."""
 
 from __future__ import annotations
 
 import itertools
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from splatam_core.config import TrackingConfig
 from splatam_core.geometry import se3
+from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.filters import is_on_host
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians, Rasterizer
-from splatam_core.tracking.base import Candidate, Matrix, TrackingResult
+from splatam_core.tracking.base import TrackingResult
+from splatam_core.tracking.candidate import Candidate
 from splatam_core.tracking.loss import TrackingLoss, tracking_loss
 from splatam_core.tracking.verdict import compare
 
 
 class RenderAndCompareTracker:
-    """Keeps the best pose of all it evaluated, the first guess included."""
+    """Returns the best of all poses that it evaluates, the predicted one included."""
 
     def __init__(self, rasterizer: Rasterizer, config: TrackingConfig, threads: int, device: torch.device) -> None:
         self._rasterizer = rasterizer
@@ -41,15 +41,15 @@ class RenderAndCompareTracker:
             ],
             fused=not is_on_host(rotation),
         )
-        guess: Candidate | None = None
+        predicted: Candidate | None = None
         steps = config.iterations
         for step in itertools.count():
             pose = _pose(rotation, translation)
             render = self._rasterizer.render(gaussians, view.camera, pose)
             loss = tracking_loss(render, view, config)
-            candidate = Candidate.of(pose, render, view, guess, loss)
-            if guess is None:
-                guess = best = candidate
+            candidate = Candidate.of(pose, render, view, predicted, loss)
+            if predicted is None:
+                predicted = best = candidate
             else:
                 best = best.or_better(candidate)
             if step == config.iterations and self._is_poor(loss, view):
@@ -62,13 +62,13 @@ class RenderAndCompareTracker:
         return compare(_float64(best.pose), best.render, view, config)
 
     def _is_poor(self, loss: TrackingLoss, view: View) -> bool:
-        """Whether depth is so far off that more steps are worth it; the original compares the sum over the image."""
+        """Returns whether the depth error is large enough for more steps; the original compares the sum over the image."""
         limit_m = self._config.paper.extend_above_m
         return limit_m > 0 and loss.depth.item() > limit_m * view.depth.numel()
 
 
 def _pose(quaternion: Tensor, translation: Tensor) -> Tensor:
-    """[4, 4] from a quaternion (w, x, y, z) of any length and a translation, differentiably."""
+    """Returns [4, 4] of a quaternion (w, x, y, z) of any length and a translation, differentiably."""
     w, x, y, z = (quaternion / quaternion.norm()).unbind()
     one, zero = torch.ones_like(w), torch.zeros_like(w)
     rows = [
@@ -80,7 +80,7 @@ def _pose(quaternion: Tensor, translation: Tensor) -> Tensor:
     return torch.stack([entry for row in rows for entry in row]).view(4, 4)
 
 
-def _float64(pose: Tensor) -> NDArray[np.float64]:
-    """The pose in double precision, its rotation orthonormal to that precision too."""
+def _float64(pose: Tensor) -> Matrix:
+    """Returns the pose in double precision, with a rotation that is orthonormal to that precision."""
     T = pose.double().numpy(force=True)
     return se3.compose(se3.quaternion_from_rotation(T[:3, :3]), T[:3, 3])

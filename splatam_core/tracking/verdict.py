@@ -6,9 +6,10 @@ import numpy as np
 import torch
 
 from splatam_core.config import TrackingConfig
+from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Render
-from splatam_core.tracking.base import Matrix, TrackingResult
+from splatam_core.tracking.base import TrackingResult
 
 
 def compare(T_cam_world: Matrix, render: Render, view: View, config: TrackingConfig) -> TrackingResult:

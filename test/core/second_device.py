@@ -187,11 +187,14 @@ class _Native(torch.autograd.Function):
         return tuple(DeviceTensor(image.detach()) for image in ctx.images)
 
     @staticmethod
-    def backward(ctx: Any, *slopes: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         wanted = [tensor for tensor in ctx.inputs if tensor is not None and tensor.requires_grad]
-        found = iter(torch.autograd.grad(ctx.images, wanted, [on_host(slope) for slope in slopes]))
-        gradients = [DeviceTensor(next(found)) if tensor is not None and tensor.requires_grad else None for tensor in ctx.inputs]
-        return None, None, *gradients
+        found = iter(torch.autograd.grad(ctx.images, wanted, [on_host(gradient) for gradient in gradients]))
+        return (
+            None,
+            None,
+            *(DeviceTensor(next(found)) if tensor is not None and tensor.requires_grad else None for tensor in ctx.inputs),
+        )
 
 
 def _values(parts: T) -> T:

@@ -48,10 +48,10 @@ def _chosen(*overrides: str) -> tuple[torch.device, str, str]:
         ((), GPU, 'triton', 'A GPU'),
         (('device=cuda',), GPU, 'triton', ''),
         (('device=cpu',), CPU, 'cpu', ''),
-        (('rasterizer=cpu',), CPU, 'cpu', 'rasterizer = cpu runs there'),
+        (('rasterizer=cpu',), CPU, 'cpu', 'rasterizer = cpu runs on it'),
         (('rasterizer=reference',), GPU, 'reference', 'A GPU'),
         (('device=cpu', 'rasterizer=reference'), CPU, 'reference', ''),
-        (('mapping.anisotropic=true',), CPU, 'cpu', 'rasterizer triton: it draws no anisotropic'),
+        (('mapping.anisotropic=true',), CPU, 'cpu', 'rasterizer triton: it does not draw anisotropic'),
         (('mapping.anisotropic=true', 'device=cuda', 'rasterizer=reference'), GPU, 'reference', ''),
     ],
 )
@@ -113,7 +113,7 @@ def test_command_line_says_once_what_auto_chose(tmp_path: Path, capsys: pytest.C
     """And why; with a device asked for there is nothing to say. Without a GPU, cuda leaves no folder behind."""
     source = ['run', 'synthetic', '--max-frames', '2', '--width', '64', '--preset', 'quick', '--no-evaluate']
     assert cli.main([*source, '--out', str(tmp_path / 'auto')]) == 0
-    assert capsys.readouterr().err.count('device = auto: cpu, for torch') == 1
+    assert capsys.readouterr().err.count('device = auto: cpu (torch') == 1
     assert cli.main([*source, '--out', str(tmp_path / 'cpu'), '--device', 'cpu']) == 0
     assert 'device' not in capsys.readouterr().err
     assert cli.main([*source, '--out', str(tmp_path / 'cuda'), '--device', 'cuda']) == cli.EXIT_ERROR

@@ -13,14 +13,14 @@ import pytest
 import torch
 from second_device import DEVICE, DeviceRasterizer, DeviceTensor, SecondDevice
 
-from splatam_core import slam, stopwatch
+from splatam_core import lifecycle, stopwatch
 from splatam_core.config import KeyframeConfig, PaperTrackingConfig, SlamConfig, TrackingConfig, load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
 from splatam_core.device import Backend
 from splatam_core.evaluation.images import ViewScorer
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.images.view import View
-from splatam_core.mapping import densification, mapper
+from splatam_core.mapping import densification, posed
 from splatam_core.mapping.keyframes import KeyframeStore
 from splatam_core.mapping.offline_refinement import refine_map
 from splatam_core.mapping.posed import PosedView
@@ -50,8 +50,8 @@ WIDTH = 160
 def _on_device(monkeypatch: pytest.MonkeyPatch) -> Iterator[SecondDevice]:
     """A Slam made in here computes on the second device."""
     with monkeypatch.context() as patch, SecondDevice() as device:
-        patch.setattr(slam, 'choose_backend', lambda config: Backend(DEVICE, 'cpu'))
-        patch.setattr(slam, 'make_rasterizer', lambda name, threads: DeviceRasterizer())
+        patch.setattr(lifecycle, 'choose_backend', lambda config: Backend(DEVICE, 'cpu'))
+        patch.setattr(lifecycle, 'make_rasterizer', lambda name, threads: DeviceRasterizer())
         patch.setattr(stopwatch, 'synchronize', lambda device: None)
         yield device
 
@@ -205,7 +205,7 @@ def test_refining_a_map_happens_on_the_device(room: Room, monkeypatch: pytest.Mo
     ('module', 'name', 'wrong'),
     [
         (densification, 'box_sums', lambda image, side: torch.zeros(image.shape)),
-        (mapper, 'pose_tensor', lambda T, device: torch.from_numpy(T).float()),
+        (posed, 'pose_tensor', lambda T, device: torch.from_numpy(T).float()),
     ],
 )
 def test_what_forgets_the_device_is_noticed(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterable
 
 import numpy as np
@@ -11,11 +12,13 @@ import rasterizer_scenes as scenes
 import torch
 from rasterizer_scenes import Scene
 
+import splatam_core
 from splatam_core.errors import RasterizerError
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
-from splatam_core.rasterizer import Gaussians, Moments, Rasterizer, Rates, Target, make_rasterizer
+from splatam_core.rasterizer import Gaussians, Moments, Rasterizer, Rates, Target, make_rasterizer, native
 from splatam_core.rasterizer.base import MAX_ALPHA, MIN_ALPHA
+from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.rasterizer.reference import ReferenceRasterizer
 
 BACKENDS = [('cpu', 1), ('cpu', 2), ('cpu', 3), ('triton', 0)]
@@ -98,12 +101,35 @@ def _assert_equals_reference(rasterizer: Rasterizer, scene: Scene, device: str =
 
 @pytest.mark.parametrize('isa', ['generic', 'avx2', 'avx512'])
 def test_every_instruction_set_equals_reference(isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the processor has it: the run-time choice must not change the picture."""
+    """Where the processor has it: the run-time choice must not change the image."""
     monkeypatch.setenv('SPLATAM_ISA', isa)
-    rasterizer = make_rasterizer('cpu', 1)
+    rasterizer = CpuRasterizer(1)
     if rasterizer.instruction_set != isa:
         pytest.skip(f'this processor runs {rasterizer.instruction_set}, not {isa}')
     _assert_equals_reference(rasterizer, SCENES['odd size'])
+
+
+def test_a_missing_native_module_is_said_where_it_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not at import: a GPU, and the reference, need none."""
+    monkeypatch.setitem(sys.modules, 'splatam_core._native', None)
+    monkeypatch.delattr(splatam_core, '_native', raising=False)
+    native._extension.cache_clear()
+    for needs_it in (lambda: make_rasterizer('cpu'), lambda: native.make_native_aligner(1)):
+        with pytest.raises(RasterizerError, match=r"cannot be loaded .* build it with 'pip install \.'") as error:
+            needs_it()
+        assert '\n' not in str(error.value)
+    make_rasterizer('reference')
+
+
+def test_fitting_natively_refuses_arrays_that_it_would_copy() -> None:
+    """A copy would be fitted, and dropped."""
+    scene = SCENES['odd size']
+    gaussians, count = scenes.on_device(scene.gaussians, 'cpu'), len(scene.gaussians)
+    wide = torch.zeros(count, 6)
+    strided = Gaussians(wide[:, ::2], gaussians.log_scales, gaussians.logit_opacities, gaussians.rgb)
+    moments = Moments(torch.zeros(count, 16), torch.zeros(count, dtype=torch.uint8))
+    with pytest.raises(TypeError, match='means'):
+        make_rasterizer('cpu', 1).fit(strided, moments, Rates(1e-4, 1e-3, 0.05, 2.5e-3), _target(scene))
 
 
 def _target(scene: Scene, device: str = 'cpu') -> Target:

@@ -79,7 +79,7 @@ def test_lists_without_room_change_nothing_but_the_time() -> None:
     loss, first = _fit(roomy, SCENE)
     same_loss, same_first = _fit(cramped, SCENE)
     assert same_loss == pytest.approx(loss, rel=1e-5)
-    # Residuals near zero take their slope from rounding.
+    # Residuals near zero take the sign of their gradient from rounding.
     assert float((same_first - first).abs().max()) < 1e-3 * float(first.abs().max())
 
 
@@ -275,7 +275,7 @@ for name in names:
     print(name, len(triton.compile(source, target=target, options=options).asm[form]))
 """
 LAUNCHED = (
-    'project', 'list_tiles', 'blend', 'blend_backward', 'blend_backward_to_pose', 'clear_if_overflown', 'project_backward',
+    'project', 'list_tiles', 'blend', 'blend_backward', 'blend_backward_to_pose', 'clear_if_overflowed', 'project_backward',
     'fit_tile', 'update',
 )  # fmt: skip
 

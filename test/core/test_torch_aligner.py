@@ -1,23 +1,26 @@
-"""Alignment's operations in torch against the native ones, and the whole tracker by either."""
+"""Both aligners, native and torch: the same results, and the same pose from the tracker with either."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from splatam_core import _native
 from splatam_core.config import AlignmentConfig, TrackingConfig, load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
 from splatam_core.device import HOST
 from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.images.view import View
 from splatam_core.rasterizer import make_rasterizer
+from splatam_core.rasterizer.native import make_native_aligner
 from splatam_core.slam import Slam
-from splatam_core.tracking import AlignmentTracker, TorchAligner, make_tracker
+from splatam_core.tracking import TorchAligner, alignment, make_tracker
+from splatam_core.tracking.torch_aligner import TorchLinearSystem
 from splatam_core.tracking.verdict import verify
 
 EDGE = 0.05
@@ -36,6 +39,20 @@ def _picture(seed: int, size: tuple[int, int]) -> tuple[Image, Image]:
     return brightness, depth.astype(np.float32)
 
 
+def _camera(size: tuple[int, int]) -> PinholeCamera:
+    height, width = size
+    return PinholeCamera(width, height, 0.9 * width, 0.91 * width, width / 2 - 0.4, height / 2 - 0.6)
+
+
+def _settings(color_motion: np.ndarray, depth_motion: np.ndarray, gain: float = 1.0, bias: float = 0.0) -> dict[str, Any]:
+    """The arguments of ``linearize`` but images and camera."""
+    return {
+        'color_motion': color_motion.astype(np.float32), 'depth_motion': depth_motion.astype(np.float32), 'velocity': VELOCITY,
+        'gain': gain, 'bias': bias, 'photometric_scale': 0.03, 'depth_scale': 0.01, 'max_depth_ratio': 0.1, 'inlier_color': 0.2,
+        'inlier_depth': 0.1,
+    }  # fmt: skip
+
+
 def _tensors(*images: Image) -> list[torch.Tensor]:
     return [torch.from_numpy(image) for image in images]
 
@@ -44,7 +61,7 @@ def _tensors(*images: Image) -> list[torch.Tensor]:
 def test_layers_and_halving_are_the_native_ones(size: tuple[int, int]) -> None:
     """Bit for bit: there is one order of the few operations."""
     picture = _picture(1, size)
-    native, ours = _native.Aligner(1), TorchAligner()
+    native, ours = make_native_aligner(1), TorchAligner()
     expected, found = native.layers(*picture, EDGE), ours.layers(*_tensors(*picture), EDGE).numpy()
     assert np.array_equal(expected[..., :6], found, equal_nan=True)
     if min(size) > 1:
@@ -52,64 +69,65 @@ def test_layers_and_halving_are_the_native_ones(size: tuple[int, int]) -> None:
             assert np.allclose(half.numpy(), expected_half, rtol=1e-6, equal_nan=True)
 
 
-@pytest.mark.parametrize('lag', [0.0, 0.3])
+@pytest.mark.parametrize('time_offset', [0.0, 0.3])
 @pytest.mark.parametrize('size', [(48, 65), (120, 160)])
-def test_linear_system_is_the_native_one(size: tuple[int, int], lag: float) -> None:
-    """With NaN depth, steps, another exposure, and colour that lags.
+def test_linear_system_is_the_native_one(size: tuple[int, int], time_offset: float) -> None:
+    """With NaN depth, steps, another exposure, and a time offset between colour and depth.
 
     Sums of float32 against sums of doubles over up to 19 200 pixels: 1e-5 of the largest entry. Counts may differ by the few
-    points that fall on a limit, and medians by a bin (an eighth of an octave) where so many lie around its edge.
+    points that fall on a limit, and medians by a bin (an eighth of an octave) where many lie around its edge.
     """
     reference, frame = _picture(2, size), _picture(3, size)
     frame = 1.1 * reference[0] + 0.2 * frame[0], np.float32(0.5) * (reference[1] + frame[1])
-    native, ours = _native.Aligner(1), TorchAligner()
+    native, ours = make_native_aligner(1), TorchAligner()
     motion = se3.exp(TWIST)
-    light = (se3.exp(lag * VELOCITY.astype(np.float64)) @ motion).astype(np.float32)
-    camera = 0.9 * size[1], 0.91 * size[1], size[1] / 2 - 0.4, size[0] / 2 - 0.6
-    numbers = (*camera, light, motion.astype(np.float32), VELOCITY, 1.05, -0.02, 0.03, 0.01, 0.1, 0.2, 0.1)
-    expected = native.linearize(*reference, native.layers(*frame, EDGE), *numbers)
-    found = ours.linearize(*_tensors(*reference), ours.layers(*_tensors(*frame), EDGE), *numbers)
-    for a, b in zip(found[:2], expected[:2], strict=True):
-        assert np.abs(a - b).max() < 1e-5 * np.abs(b).max()
-    assert found[2] == pytest.approx(expected[2], rel=1e-4)
-    assert found[3] == expected[3]
-    assert np.abs(np.subtract(found[4:7], expected[4:7])).max() <= 2 and found[5] > 0.3 * found[3]
-    assert found[7:] == pytest.approx(expected[7:], rel=0.13)
+    color_motion = se3.exp(time_offset * VELOCITY.astype(np.float64)) @ motion
+    settings = _settings(color_motion, motion, gain=1.05, bias=-0.02) | {'camera': _camera(size)}
+    expected = native.linearize(*reference, native.layers(*frame, EDGE), **settings)
+    found = ours.linearize(*_tensors(*reference), ours.layers(*_tensors(*frame), EDGE), **settings)
+    for a, b in ((found.H, expected.H), (found.g, expected.g)):
+        assert a.shape == b.shape and np.abs(a - b).max() < 1e-5 * np.abs(b).max()
+    assert found.cost == pytest.approx(expected.cost, rel=1e-4)
+    assert found.points == expected.points
+    for name in ('compared', 'seen', 'agreeing'):
+        assert abs(getattr(found, name) - getattr(expected, name)) <= 2
+    assert found.seen > 0.3 * found.points
+    assert found.photometric_median == pytest.approx(expected.photometric_median, rel=0.13)
+    assert found.depth_median == pytest.approx(expected.depth_median, rel=0.13)
 
 
 def test_nothing_in_sight_gives_an_empty_system() -> None:
     """No points, or none that fall into the frame: zeros, and medians that are NaN."""
     brightness, depth = _picture(4, (40, 50))
-    ours, away = TorchAligner(), se3.exp(np.array([50.0, 0, 0, 0, 0, 0])).astype(np.float32)
-    still = np.eye(4, dtype=np.float32)
-    for motion, z in ((away, depth), (still, np.full_like(depth, np.nan))):
+    ours, away = TorchAligner(), se3.exp(np.array([50.0, 0, 0, 0, 0, 0]))
+    for motion, z in ((away, depth), (np.eye(4), np.full_like(depth, np.nan))):
         tensors = _tensors(brightness, z)
         layers = ours.layers(*_tensors(brightness, depth), EDGE)
-        numbers = (45.0, 45.0, 24.0, 19.0, motion, motion, VELOCITY, 1.0, 0.0, 0.03, 0.01, 0.1, 0.2, 0.1)
-        H, g, cost, points, compared, seen, agreeing, *medians = ours.linearize(*tensors, layers, *numbers)
-        assert not H.any() and not g.any() and cost == 0
-        assert points == (z > 0).sum() and compared == seen == agreeing == 0
-        assert np.isnan(medians).all()
+        camera = PinholeCamera(50, 40, 45.0, 45.0, 24.0, 19.0)
+        system = ours.linearize(*tensors, layers, camera=camera, **_settings(motion, motion))
+        assert not system.H.any() and not system.g.any() and system.cost == 0
+        assert system.points == (z > 0).sum() and system.compared == system.seen == system.agreeing == 0
+        assert np.isnan([system.photometric_median, system.depth_median]).all()
 
 
-@pytest.mark.parametrize(('lag', 'half_render_from'), [(True, 0), (False, 160)])
+@pytest.mark.parametrize(('time_offset', 'half_render_from'), [(True, 0), (False, 160)])
 def test_tracker_finds_the_same_pose_by_either(
-    lag: bool, half_render_from: int, room: Callable[..., SyntheticSequence], monkeypatch: pytest.MonkeyPatch
+    time_offset: bool, half_render_from: int, room: Callable[..., SyntheticSequence], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To 0.2 mm, a fiftieth of a pixel here: Gauss-Newton amplifies the rounding of points on the border a little."""
     sequence = room(3, 160)
     slam = Slam(load_config('quick', ['threads=1', 'device=cpu']))
     for index in range(2):
         slam.process(sequence[index])
-    config = TrackingConfig(method='align', iterations=6, align=AlignmentConfig(time_offset=lag, half_render_from=half_render_from))
+    align = AlignmentConfig(time_offset=time_offset, half_render_from=half_render_from)
+    config = TrackingConfig(method='align', iterations=6, align=align)
     view = View.from_frame(sequence[2], slam.config.depth)
     truth = sequence.ground_truth().T_world_cam
     before, guess = (se3.inverse(truth[index]) @ truth[0] for index in (0, 1))
     results = []
-    for aligner in (_native.Aligner(1), TorchAligner()):
+    for aligner in (make_native_aligner(1), _Bridge(TorchAligner())):
+        monkeypatch.setattr(alignment, 'make_aligner', lambda threads, device, aligner=aligner: aligner)
         tracker = make_tracker(make_rasterizer('cpu', 1), config, 1, HOST)
-        assert isinstance(tracker, AlignmentTracker)
-        monkeypatch.setattr(tracker, '_aligner', _Bridge(aligner) if isinstance(aligner, TorchAligner) else aligner)
         results.append(tracker.track(view, slam.map.gaussians, guess, before))
     native, ours = results
     assert not verify(native, config) and not verify(ours, config)
@@ -119,7 +137,7 @@ def test_tracker_finds_the_same_pose_by_either(
 
 
 class _Bridge:
-    """The aligner in torch for pictures in numpy's arrays."""
+    """The aligner in torch, for images as numpy arrays."""
 
     def __init__(self, aligner: TorchAligner) -> None:
         self._aligner = aligner
@@ -130,5 +148,5 @@ class _Bridge:
     def halve(self, brightness: Image, depth: Image, max_step: float) -> tuple[Image, ...]:
         return tuple(image.numpy() for image in self._aligner.halve(*_tensors(brightness, depth), max_step))
 
-    def linearize(self, brightness: Image, depth: Image, layers: Image, *numbers: object) -> tuple:
-        return self._aligner.linearize(*_tensors(brightness, depth, layers), *numbers)
+    def linearize(self, brightness: Image, depth: Image, layers: Image, **settings: Any) -> TorchLinearSystem:
+        return self._aligner.linearize(*_tensors(brightness, depth, layers), **settings)

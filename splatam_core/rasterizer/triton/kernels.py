@@ -1,14 +1,14 @@
-"""The kernels of the ``triton`` rasterizer: project, list, blend, and the same way back.
+"""The kernels of the ``triton`` rasterizer: project, list, blend, and their backward passes.
 
-One program blends one tile, a chunk of Gaussians at a time: within a chunk the transmittance in front of each is a running
-product. Gradients of a list's entries go to the places which the entries had before they were sorted by tile: there those of
-one Gaussian lie side by side, and are summed without atomics.
+One program blends one tile, a chunk of Gaussians at a time. Within a chunk the transmittance in front of each Gaussian is a
+running product. Gradients of entries are stored where the entries were before they were sorted by tile: there the entries of
+one Gaussian are adjacent, and are summed without atomics.
 
-An isotropic footprint is separable, but not to advantage here: a tile of 8x8 pixels is two a thread, which share a column, so
-three exponentials would take the place of two.
+An isotropic footprint is separable, but that does not help here: with two pixels of an 8x8 tile per thread, which share a column,
+it would take three exponentials instead of two.
 
-Written so that Triton's compiler and its interpreter both take them: blocks are powers of two, every load and store is masked or
-known to be inside, loops are ``while`` over scalars.
+The code runs in Triton's compiler and in its interpreter: blocks are powers of two, every load and store is masked or known to be
+inside, loops are ``while`` over scalars.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import triton.language as tl
 from splatam_core.rasterizer import base
 
 NEAR_M = tl.constexpr(base.NEAR_M)
-FAR_M = tl.constexpr(1e30)  # what is not finite is not drawn
+FAR_M = tl.constexpr(1e30)  # not drawn beyond, nor where not finite
 BLUR_PX2 = tl.constexpr(base.BLUR_PX2)
 MAX_ALPHA = tl.constexpr(base.MAX_ALPHA)
 MIN_ALPHA = tl.constexpr(base.MIN_ALPHA)
@@ -31,11 +31,11 @@ BETA_1, BETA_2, EPSILON = tl.constexpr(base.BETA_1), tl.constexpr(base.FIT_BETA_
 FIELDS = tl.constexpr(8)  # of a splat (u, v, falloff, opacity, r, g, b, z) and of its gradient, as in csrc/kernels.hpp
 
 
-def launch(kernel: Any, programs: int, *arguments: object, warps: int, **constants: int) -> None:
-    """Start a kernel; nothing where there is nothing to do. A program has ``warps`` of 32 threads (AMD: 64)."""
+def launch(kernel: Any, programs: int, *, warps: int, **arguments: object) -> None:
+    """Starts a kernel, unless there are no programs. A program has ``warps`` of 32 threads (AMD: 64)."""
     if programs:
-        # Fused multiply-adds are Triton's default up to 3.9, and should stay.
-        kernel[(programs,)](*arguments, num_warps=warps, enable_fp_fusion=True, **constants)
+        # Fused multiply-adds are on by default up to Triton 3.9; this keeps them on.
+        kernel[(programs,)](**arguments, num_warps=warps, enable_fp_fusion=True)
 
 
 @triton.jit(do_not_specialize=['n'])
@@ -43,7 +43,7 @@ def project(
     means, log_scales, logit_opacities, rgb, pose, splats, depths, rects, counts,
     n, width, height, fx, fy, cx, cy, TILE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Gaussians onto the image: splats [N, 8], depths [N] (inf = not drawn), rects [N, 2] (see ``_pack``), tiles touched [N]."""
+    """Projects Gaussians: splats [N, 8], depths [N] (inf = not drawn), rects [N, 2] (see ``_touched_tiles``), tile counts [N]."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     real = i < n
     cam_x, cam_y, cam_z = _into_camera(means, pose, i, real)
@@ -70,7 +70,7 @@ def project(
 
 @triton.jit
 def _into_camera(means, pose, i, real):
-    """Camera coordinates of the centres."""
+    """Returns the camera coordinates of the centres."""
     x = tl.load(means + 3 * i, mask=real, other=0.0)
     y = tl.load(means + 3 * i + 1, mask=real, other=0.0)
     z = tl.load(means + 3 * i + 2, mask=real, other=0.0)
@@ -82,7 +82,7 @@ def _into_camera(means, pose, i, real):
 
 @triton.jit
 def _store_splat(record, u, v, falloff, opacity, z, rgb, real, drawn):
-    """A splat's eight numbers; one that is not drawn is invisible and finite, so that meeting it does no harm."""
+    """Stores a splat's eight numbers. One that is not drawn is invisible and finite, so that blending it changes nothing."""
     tl.store(record, tl.where(drawn, u, 0.0), mask=real)
     tl.store(record + 1, tl.where(drawn, v, 0.0), mask=real)
     tl.store(record + 2, tl.where(drawn, falloff, -1.0), mask=real)
@@ -95,7 +95,7 @@ def _store_splat(record, u, v, falloff, opacity, z, rgb, real, drawn):
 
 @triton.jit
 def _touched_tiles(u, v, extent, width, height, TILE: tl.constexpr):
-    """The tiles a disc touches, packed, and how many they are: a rectangle less the corners which the disc misses."""
+    """Returns the tiles a disc touches, packed, and their number: a rectangle without the corners that the disc misses."""
     x0 = tl.minimum(tl.maximum(u - extent, 0.0), width - 1.0).to(tl.int32) // TILE
     x1 = tl.minimum(tl.maximum(u + extent, 0.0), width - 1.0).to(tl.int32) // TILE
     y0 = tl.minimum(tl.maximum(v - extent, 0.0), height - 1.0).to(tl.int32) // TILE
@@ -119,9 +119,9 @@ def _touched_tiles(u, v, extent, width, height, TILE: tl.constexpr):
 
 @triton.jit(do_not_specialize=['n', 'capacity'])
 def list_tiles(order, ends, counts, rects, starts, tiles, ids, n, capacity, tiles_x, BLOCK: tl.constexpr):
-    """Write what each Gaussian touches, nearest first: tiles and ids [capacity]. What finds no room is left out.
+    """Writes the entries of each Gaussian, nearest first: tiles and ids [capacity]. Entries beyond the capacity are dropped.
 
-    ``ends`` [N] says where those of a Gaussian end, by depth; ``starts`` [N] gets where they start, by id.
+    ``ends`` [N] is the index behind a Gaussian's last entry, by depth; ``starts`` [N] gets that of its first one, by id.
     """
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     real = place < n
@@ -150,7 +150,7 @@ def list_tiles(order, ends, counts, rects, starts, tiles, ids, n, capacity, tile
 
 @triton.jit
 def _span(begins, total, tile, n, capacity):
-    """From where to where a tile's list goes, and whether lists found room; else it is the whole depth order."""
+    """Returns begin and end of a tile's list, and whether the lists fit; if not, the list is the whole depth order."""
     fits = tl.load(total) <= capacity
     begin, end = tl.load(begins + tile), tl.load(begins + tile + 1)
     return tl.where(fits, begin, 0), tl.where(fits, end, n), fits
@@ -158,7 +158,7 @@ def _span(begins, total, tile, n, capacity):
 
 @triton.jit
 def _listed_ids(order, entries, at, end, fits, CHUNK: tl.constexpr):
-    """[CHUNK] ids of a list from a place on, and which are within it."""
+    """Returns [CHUNK] ids of a list from a position on, and a mask of those within the list."""
     place = at + tl.arange(0, CHUNK)
     listed = place < end
     from_lists = tl.load(entries + place, mask=place < tl.where(fits, end, 0), other=0)
@@ -168,7 +168,7 @@ def _listed_ids(order, entries, at, end, fits, CHUNK: tl.constexpr):
 
 @triton.jit
 def _offsets(splat, listed, x, y):
-    """[CHUNK, P] from the centres to the pixels, and the alphas before they are clamped."""
+    """Returns [CHUNK, P] offsets from the centres to the pixels, and the alphas before they are clamped."""
     dx = x[None, :] - tl.load(splat, mask=listed, other=0.0)[:, None]
     dy = y[None, :] - tl.load(splat + 1, mask=listed, other=0.0)[:, None]
     falloff = tl.load(splat + 2, mask=listed, other=0.0)[:, None]
@@ -178,7 +178,7 @@ def _offsets(splat, listed, x, y):
 
 @triton.jit
 def _weights(raw, T):
-    """[CHUNK, P] alphas, what they leave, transmittance in front of each, weights; [P] transmittance behind all."""
+    """Returns [CHUNK, P] alphas, 1 - alphas, transmittance in front of each, weights; [P] transmittance behind all."""
     alpha = tl.where(raw < MIN_ALPHA, 0.0, tl.minimum(raw, MAX_ALPHA))
     left = 1.0 - alpha
     passed = tl.cumprod(left, axis=0)
@@ -189,7 +189,7 @@ def _weights(raw, T):
 
 @triton.jit
 def _pixels(tiles_x, width, height, TILE: tl.constexpr):
-    """[P] columns and rows of this program's pixels, and which are on the image."""
+    """Returns [P] columns and rows of this program's pixels, and a mask of those inside the image."""
     tile = tl.program_id(0)
     pixel = tl.arange(0, TILE * TILE)
     x = tile % tiles_x * TILE + pixel % TILE
@@ -199,7 +199,7 @@ def _pixels(tiles_x, width, height, TILE: tl.constexpr):
 
 @triton.jit
 def _blend(splats, order, entries, begin, end, n, fits, x, y, on_image, CHUNK: tl.constexpr):
-    """[P] colour, depth and silhouette."""
+    """Returns [P] colour, depth and silhouette."""
     T = tl.where(on_image, 1.0, 0.0)
     r, g, b = tl.zeros_like(T), tl.zeros_like(T), tl.zeros_like(T)
     depth, silhouette = tl.zeros_like(T), tl.zeros_like(T)
@@ -224,7 +224,7 @@ def blend(
     splats, order, entries, begins, total, rgb, depth_acc, silhouette,
     n, capacity, width, height, tiles_x, TILE: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
-    """A tile's pixels of the images, planar: rgb [3, H, W], depth_acc and silhouette [H, W]."""
+    """Draws a tile of the images: rgb [3, H, W], depth_acc and silhouette [H, W]."""
     column, row, on_image = _pixels(tiles_x, width, height, TILE)
     x, y = column.to(tl.float32), row.to(tl.float32)
     begin, end, fits = _span(begins, total, tl.program_id(0), n, capacity)
@@ -238,14 +238,15 @@ def blend(
 
 
 @triton.jit
-def _slopes(splat, listed, x, y, T, Q, gr, gg, gb, gd, gs):
-    """Gradients by a chunk's splats, summed over the pixels; what is behind the chunk.
+def _chunk_gradients(splat, listed, x, y, T, Q, gr, gg, gb, gd, gs):
+    """Computes the gradients by a chunk's splats, summed over the pixels.
 
-    With q_k = sum over channels of (gradient times what k adds) and Q what is still to come of sum_k w_k q_k, the whole backward
-    pass is dL/dalpha_k = T_k q_k - Q / (1 - alpha_k).
+    With q_k = sum over channels of (gradient of the channel times value of splat k), and Q the part of sum_k w_k q_k that is still
+    to come, dL/dalpha_k = T_k q_k - Q / (1 - alpha_k).
 
     Returns:
-        [CHUNK] sums of the slope by log alpha times 1, dx, dy, d^2, and of that by z; [CHUNK, P] the weights; [P] T and Q behind.
+        [CHUNK] sums of the gradient by log alpha times 1, dx, dy, d^2, and of the gradient by z; [CHUNK, P] weights; [P] T and Q
+        behind the chunk.
     """
     dx, dy, raw = _offsets(splat, listed, x, y)
     alpha, left, before, weight, T = _weights(raw, T)
@@ -255,10 +256,10 @@ def _slopes(splat, listed, x, y, T, Q, gr, gg, gb, gd, gs):
     q += gd[None, :] * tl.load(splat + 7, mask=listed, other=0.0)[:, None] + gs[None, :]
     added = tl.cumsum(weight * q, axis=0)
     behind = Q[None, :] - added
-    slope = tl.where((weight > 0.0) & (raw <= MAX_ALPHA), alpha * (before * q - behind / left), 0.0)
-    by_x, by_y = slope * dx, slope * dy
+    by_log_alpha = tl.where((weight > 0.0) & (raw <= MAX_ALPHA), alpha * (before * q - behind / left), 0.0)
+    by_x, by_y = by_log_alpha * dx, by_log_alpha * dy
     return (
-        tl.sum(slope, axis=1), tl.sum(by_x, axis=1), tl.sum(by_y, axis=1), tl.sum(by_x * dx + by_y * dy, axis=1),
+        tl.sum(by_log_alpha, axis=1), tl.sum(by_x, axis=1), tl.sum(by_y, axis=1), tl.sum(by_x * dx + by_y * dy, axis=1),
         tl.sum(weight * gd[None, :], axis=1), weight, T, Q - tl.sum(weight * q, axis=0),
     )  # fmt: skip
 
@@ -267,12 +268,12 @@ def _slopes(splat, listed, x, y, T, Q, gr, gg, gb, gd, gs):
 def _to_entries(
     splats, order, entries, slots, gradients, begin, end, fits, x, y, on_image, Q, gr, gg, gb, gd, gs, CHUNK: tl.constexpr
 ):  # fmt: skip
-    """Front to back again, to gradients [rows, 8]: of entries in their slots; by atomics of Gaussians where lists found no room."""
+    """Visits a list front to back and writes gradients [rows, 8]: by entry, or by Gaussian with atomics if the lists do not fit."""
     T = tl.where(on_image, 1.0, 0.0)
     at, live = begin, tl.max(T, axis=0)
     while (at < end) & (live >= MIN_TRANSMITTANCE):
         ids, listed = _listed_ids(order, entries, at, end, fits, CHUNK)
-        s0, sx, sy, s2, sz, weight, T, Q = _slopes(splats + FIELDS * ids, listed, x, y, T, Q, gr, gg, gb, gd, gs)
+        s0, sx, sy, s2, sz, weight, T, Q = _chunk_gradients(splats + FIELDS * ids, listed, x, y, T, Q, gr, gg, gb, gd, gs)
         sr, sg, sb = (
             tl.sum(weight * gr[None, :], axis=1), tl.sum(weight * gg[None, :], axis=1), tl.sum(weight * gb[None, :], axis=1),
         )  # fmt: skip
@@ -285,7 +286,7 @@ def _to_entries(
         at += CHUNK
     if fits:
         nothing = tl.zeros([CHUNK], tl.float32)
-        while at < end:  # hidden by what is in front
+        while at < end:  # entries behind an opaque one
             place = at + tl.arange(0, CHUNK)
             into = gradients + FIELDS * tl.load(slots + place, mask=place < end, other=0)
             _store_entry(into, place < end, nothing, nothing, nothing, nothing, nothing, nothing, nothing, nothing)
@@ -318,7 +319,7 @@ def _add_entry(into, real, s0, sx, sy, s2, sr, sg, sb, sz):
 
 @triton.jit
 def _through_projection(u, v, falloff, z, sx, sy, s2, sz, fx, fy, cx, cy):
-    """From sums over pixels to the gradient by the centre in camera coordinates, and by the log scale."""
+    """Returns the gradients by the centre in camera coordinates and by the log scale, from sums over pixels."""
     inverse_variance = -2.0 * falloff
     spread = 2.0 * (1.0 / inverse_variance - BLUR_PX2)  # d variance / d log scale
     by_scale = 0.5 * s2 * inverse_variance * inverse_variance * spread
@@ -329,8 +330,8 @@ def _through_projection(u, v, falloff, z, sx, sy, s2, sz, fx, fy, cx, cy):
 
 
 @triton.jit
-def _load_slopes(rgb, depth_acc, silhouette, at, plane, on_image):
-    """[P] of the five images or of the gradients by them."""
+def _load_images(rgb, depth_acc, silhouette, at, plane, on_image):
+    """Returns [P] values of the five planes of the images, or of the gradients by them."""
     return (
         tl.load(rgb + at, mask=on_image, other=0.0), tl.load(rgb + plane + at, mask=on_image, other=0.0),
         tl.load(rgb + 2 * plane + at, mask=on_image, other=0.0), tl.load(depth_acc + at, mask=on_image, other=0.0),
@@ -343,11 +344,11 @@ def blend_backward(
     splats, order, entries, slots, begins, total, rgb, depth_acc, silhouette, by_rgb, by_depth_acc, by_silhouette, gradients,
     n, capacity, width, height, tiles_x, TILE: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
-    """From gradients by a tile's pixels to gradients of its list's entries."""
+    """Turns gradients by a tile's pixels into gradients of the entries of its list."""
     column, row, on_image = _pixels(tiles_x, width, height, TILE)
     at, plane = row * width + column, width * height
-    r, g, b, d, s = _load_slopes(rgb, depth_acc, silhouette, at, plane, on_image)
-    gr, gg, gb, gd, gs = _load_slopes(by_rgb, by_depth_acc, by_silhouette, at, plane, on_image)
+    r, g, b, d, s = _load_images(rgb, depth_acc, silhouette, at, plane, on_image)
+    gr, gg, gb, gd, gs = _load_images(by_rgb, by_depth_acc, by_silhouette, at, plane, on_image)
     begin, end, fits = _span(begins, total, tl.program_id(0), n, capacity)
     _to_entries(
         splats, order, entries, slots, gradients, begin, end, fits, column.to(tl.float32), row.to(tl.float32), on_image,
@@ -360,11 +361,11 @@ def blend_backward_to_pose(
     splats, order, entries, begins, total, rgb, depth_acc, silhouette, by_rgb, by_depth_acc, by_silhouette, pose_sums,
     n, capacity, width, height, tiles_x, fx, fy, cx, cy, TILE: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
-    """From gradients by a tile's pixels to pose_sums [tiles, 12] (see ``_store_pose_sums``); no Gaussian keeps one of its own."""
+    """Turns gradients by a tile's pixels into pose_sums [tiles, 12] (see ``_store_pose_sums``), without gradients of Gaussians."""
     column, row, on_image = _pixels(tiles_x, width, height, TILE)
     at_pixel, plane = row * width + column, width * height
-    r, g, b, d, s = _load_slopes(rgb, depth_acc, silhouette, at_pixel, plane, on_image)
-    gr, gg, gb, gd, gs = _load_slopes(by_rgb, by_depth_acc, by_silhouette, at_pixel, plane, on_image)
+    r, g, b, d, s = _load_images(rgb, depth_acc, silhouette, at_pixel, plane, on_image)
+    gr, gg, gb, gd, gs = _load_images(by_rgb, by_depth_acc, by_silhouette, at_pixel, plane, on_image)
     x, y = column.to(tl.float32), row.to(tl.float32)
     T, Q = tl.where(on_image, 1.0, 0.0), gr * r + gg * g + gb * b + gd * d + gs * s
     tile = tl.program_id(0)
@@ -376,7 +377,7 @@ def blend_backward_to_pose(
     while (at < end) & (live >= MIN_TRANSMITTANCE):
         ids, listed = _listed_ids(order, entries, at, end, fits, CHUNK)
         splat = splats + FIELDS * ids
-        s0, sx, sy, s2, sz, weight, T, Q = _slopes(splat, listed, x, y, T, Q, gr, gg, gb, gd, gs)
+        s0, sx, sy, s2, sz, weight, T, Q = _chunk_gradients(splat, listed, x, y, T, Q, gr, gg, gb, gd, gs)
         u, v = tl.load(splat, mask=listed, other=0.0), tl.load(splat + 1, mask=listed, other=0.0)
         falloff, z = tl.load(splat + 2, mask=listed, other=-1.0), tl.load(splat + 7, mask=listed, other=1.0)
         dx, dy, dz, by_scale = _through_projection(u, v, falloff, z, sx, sy, s2, sz, fx, fy, cx, cy)
@@ -400,7 +401,7 @@ def blend_backward_to_pose(
 
 @triton.jit
 def _store_pose_sums(into, xx, xy, xz, x1, yx, yy, yz, y1, zx, zy, zz, z1):
-    """[3, 4]: sums of the gradient by a centre's camera coordinates (rows) times these coordinates and one (columns)."""
+    """Stores [3, 4]: sums of the gradient by a centre's camera coordinates (rows) times these coordinates and one (columns)."""
     tl.store(into, xx)
     tl.store(into + 1, xy)
     tl.store(into + 2, xz)
@@ -416,8 +417,8 @@ def _store_pose_sums(into, xx, xy, xz, x1, yx, yy, yz, y1, zx, zy, zz, z1):
 
 
 @triton.jit(do_not_specialize=['rows', 'capacity'])
-def clear_if_overflown(gradients, total, rows, capacity, BLOCK: tl.constexpr):
-    """Prepare gradients [rows, 8] for atomics; where lists found room there is nothing to do."""
+def clear_if_overflowed(gradients, total, rows, capacity, BLOCK: tl.constexpr):
+    """Sets gradients [rows, 8] to zero, for atomics, if the lists do not fit."""
     if tl.load(total) > capacity:
         i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
         tl.store(gradients + i, tl.zeros([BLOCK], tl.float32), mask=i < FIELDS * rows)
@@ -425,7 +426,7 @@ def clear_if_overflown(gradients, total, rows, capacity, BLOCK: tl.constexpr):
 
 @triton.jit
 def _collected(gradients, starts, counts, total, i, real, capacity, BLOCK: tl.constexpr):
-    """[BLOCK] eight sums over the entries of each Gaussian, as in csrc's SplatGradient."""
+    """Returns [BLOCK] eight sums over the entries of each Gaussian, as in csrc's SplatGradient."""
     fits = tl.load(total) <= capacity
     count = tl.load(counts + i, mask=real, other=0)
     start = tl.where(fits, tl.load(starts + i, mask=real, other=0), i.to(tl.int64))
@@ -452,7 +453,7 @@ def _collected(gradients, starts, counts, total, i, real, capacity, BLOCK: tl.co
 
 @triton.jit
 def _to_world(pose, dx, dy, dz):
-    """A gradient by camera coordinates as one by world coordinates."""
+    """Converts a gradient by camera coordinates to one by world coordinates."""
     x = tl.load(pose) * dx + tl.load(pose + 4) * dy + tl.load(pose + 8) * dz
     y = tl.load(pose + 1) * dx + tl.load(pose + 5) * dy + tl.load(pose + 9) * dz
     z = tl.load(pose + 2) * dx + tl.load(pose + 6) * dy + tl.load(pose + 10) * dz
@@ -464,7 +465,7 @@ def project_backward(
     splats, starts, counts, total, gradients, pose, by_means, by_log_scales, by_logit_opacities, by_rgb, pose_sums,
     n, capacity, fx, fy, cx, cy, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """From gradients of entries to those of all Gaussians, zero where not drawn, and to pose_sums [programs, 12]."""
+    """Turns gradients of entries into those of all Gaussians, zero where not drawn, and into pose_sums [programs, 12]."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     real = i < n
     s0, sx, sy, s2, sr, sg, sb, sz = _collected(gradients, starts, counts, total, i, real, capacity, BLOCK)
@@ -492,7 +493,7 @@ def project_backward(
 
 @triton.jit
 def _difference(drawn, wanted, weight, limit, counted):
-    """[P] Huber's loss, and its gradient: a parabola up to the limit, a line beyond."""
+    """Returns [P] Huber's loss, quadratic up to the limit and linear beyond, and its gradient."""
     difference = tl.where(counted, drawn - wanted, 0.0)
     size = tl.abs(difference)
     loss = tl.where(size <= limit, difference * difference / (2.0 * limit), size - 0.5 * limit)
@@ -504,7 +505,7 @@ def fit_tile(
     splats, order, entries, slots, begins, total, rgb8, depth, readings, gradients, losses,
     n, capacity, width, height, tiles_x, color_weight, depth_weight, TILE: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
-    """Blend a tile, compare it with the target rgb8 [H, W, 3] and depth [H, W], and go back, in one go; losses [tiles]."""
+    """Blends a tile, compares it with rgb8 [H, W, 3] and depth [H, W], and writes gradients of the entries and losses [tiles]."""
     column, row, on_image = _pixels(tiles_x, width, height, TILE)
     x, y, at = column.to(tl.float32), row.to(tl.float32), row * width + column
     begin, end, fits = _span(begins, total, tl.program_id(0), n, capacity)
@@ -527,7 +528,7 @@ def fit_tile(
 
 @triton.jit
 def _adam(value, moment, gradient, rate, left_1, left_2, seen):
-    """One step of one parameter (Kingma and Ba 2015); its new value."""
+    """Takes one step of one parameter (Kingma and Ba 2015). Returns its new value."""
     first = BETA_1 * tl.load(moment, mask=seen, other=0.0) + (1.0 - BETA_1) * gradient
     second = BETA_2 * tl.load(moment + 8, mask=seen, other=0.0) + (1.0 - BETA_2) * gradient * gradient
     tl.store(moment, first, mask=seen)
@@ -543,7 +544,7 @@ def update(
     bounds, n, capacity, fx, fy, cx, cy, means_rate, log_scales_rate, logit_opacities_rate, rgb_rate,
     HAS_BOUNDS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Adam steps of the Gaussians that got a gradient. One program per block of ``bounds`` [blocks, 7], which grow along."""
+    """Takes Adam steps of the Gaussians with a gradient, and extends ``bounds`` [blocks, 7]. One program per block."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     s0, sx, sy, s2, sr, sg, sb, sz = _collected(gradients, starts, counts, total, i, i < n, capacity, BLOCK)
     seen = (i < n) & ((s0 != 0.0) | (sr != 0.0) | (sg != 0.0) | (sb != 0.0) | (sz != 0.0))

@@ -1,0 +1,157 @@
+"""Types of the native extension, which ``csrc/bindings.cpp`` defines.
+
+Arrays are C-contiguous. An array that a call writes to must have exactly the stated type and layout, else it is a TypeError.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatam_core.geometry.camera import PinholeCamera
+
+Floats = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+
+BLOCK: int
+"""Gaussians per row of ``Gaussians.bounds``."""
+
+class View:
+    """What ``Engine.forward`` stores for ``Engine.backward``."""
+
+class Engine:
+    """Renders and fits isotropic Gaussians."""
+
+    def __init__(self, threads: int) -> None: ...
+    @property
+    def instruction_set(self) -> str:
+        """``generic``, ``avx2`` or ``avx512``."""
+
+    def forward(
+        self,
+        *,
+        means: Floats,
+        log_scales: Floats,
+        logit_opacities: Floats,
+        rgb: Floats,
+        bounds: Floats | None,
+        T_cam_world: Floats,
+        camera: PinholeCamera,
+        image: Floats,
+        depth: Floats,
+        silhouette: Floats,
+    ) -> View:
+        """Draws Gaussians; writes image [3, H, W], depth [H, W] (``depth_acc``) and silhouette [H, W]."""
+
+    def backward(
+        self,
+        view: View,
+        *,
+        means: Floats,
+        log_scales: Floats,
+        logit_opacities: Floats,
+        rgb: Floats,
+        images: Sequence[Floats],
+        image_gradients: Sequence[Floats],
+        means_gradient: Floats | None,
+        log_scales_gradient: Floats | None,
+        logit_opacities_gradient: Floats | None,
+        rgb_gradient: Floats | None,
+        pose_gradient: Floats,
+    ) -> None:
+        """Writes gradients of a loss, given those by the three images, which must be as drawn.
+
+        The gradients by the Gaussians must be zero before; None where one is not wanted. ``pose_gradient`` is [4, 4].
+        """
+
+    def fit(
+        self,
+        *,
+        means: Floats,
+        log_scales: Floats,
+        logit_opacities: Floats,
+        rgb: Floats,
+        bounds: Floats | None,
+        moments: Floats,
+        steps: Bytes,
+        rates: tuple[float, float, float, float],
+        T_cam_world: Floats,
+        camera: PinholeCamera,
+        target_rgb: Bytes,
+        target_depth: Floats,
+        color_weight: float,
+        depth_weight: float,
+        color_limit: float,
+        depth_limit: float,
+    ) -> float:
+        """Takes one Adam step in place, with ``rates`` for the first four arrays. Returns the loss before the step."""
+
+class LinearSystem:
+    """See ``tracking.aligner.LinearSystem``."""
+
+    @property
+    def H(self) -> NDArray[np.float64]: ...
+    @property
+    def g(self) -> NDArray[np.float64]: ...
+    @property
+    def cost(self) -> float: ...
+    @property
+    def points(self) -> int: ...
+    @property
+    def compared(self) -> int: ...
+    @property
+    def seen(self) -> int: ...
+    @property
+    def agreeing(self) -> int: ...
+    @property
+    def photometric_median(self) -> float: ...
+    @property
+    def depth_median(self) -> float: ...
+
+class Aligner:
+    """See ``tracking.aligner.Aligner``. Layers have two more channels of padding."""
+
+    def __init__(self, threads: int) -> None: ...
+    def layers(self, brightness: Floats, depth: Floats, max_step: float) -> Floats: ...
+    def halve(self, brightness: Floats, depth: Floats, max_step: float) -> tuple[Floats, Floats]: ...
+    def linearize(
+        self,
+        brightness: Floats,
+        depth: Floats,
+        layers: Floats,
+        *,
+        camera: PinholeCamera,
+        color_motion: Floats,
+        depth_motion: Floats,
+        velocity: Floats,
+        gain: float,
+        bias: float,
+        photometric_scale: float,
+        depth_scale: float,
+        max_depth_ratio: float,
+        inlier_color: float,
+        inlier_depth: float,
+    ) -> LinearSystem: ...
+
+class TileLists:
+    """What ``Blender.forward`` stores for ``Blender.backward``."""
+
+class Blender:
+    """Blends ellipses front to back: the image half of anisotropic rendering."""
+
+    def __init__(self, threads: int) -> None: ...
+    def forward(self, shapes: Floats, features: Floats, image: Floats) -> TileLists:
+        """Writes image [5, H, W], from shapes [K, 6] (u, v, conic, opacity) and features [K, 4] (rgb, z), front to back."""
+
+    def backward(
+        self,
+        lists: TileLists,
+        *,
+        shapes: Floats,
+        features: Floats,
+        image: Floats,
+        image_gradient: Floats,
+        shapes_gradient: Floats,
+        features_gradient: Floats,
+    ) -> None:
+        """Writes the gradients of a loss, given that by the image, which must be as drawn."""

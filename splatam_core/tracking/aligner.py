@@ -1,0 +1,113 @@
+"""The arithmetic of direct alignment, behind one contract: native on the CPU, ``TorchAligner`` on any device."""
+
+from __future__ import annotations
+
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.geometry.se3 import Matrix
+
+Array = NDArray[np.float32]
+ImageT = TypeVar('ImageT', Array, Tensor)
+
+
+class LinearSystem(Protocol):
+    """The residuals of a reference in a frame, linearised at one estimate, and how well the two agree there.
+
+    The unknowns are the twist of the camera (6), gain and bias of the brightness, and the time offset between colour and
+    depth. A point is a pixel of the reference with depth.
+    """
+
+    @property
+    def H(self) -> Matrix:
+        """[9, 9] weighted normal matrix."""
+
+    @property
+    def g(self) -> Matrix:
+        """[9] weighted gradient."""
+
+    @property
+    def cost(self) -> float:
+        """Robust cost, summed over the points seen."""
+
+    @property
+    def points(self) -> int:
+        """Number of points."""
+
+    @property
+    def compared(self) -> int:
+        """Of these, points that project onto a depth reading of the frame."""
+
+    @property
+    def seen(self) -> int:
+        """Of these, points on the same surface as the reading."""
+
+    @property
+    def agreeing(self) -> int:
+        """Of these, points whose residuals of brightness and depth are inliers."""
+
+    @property
+    def photometric_median(self) -> float:
+        """Median absolute residual of brightness; NaN if no point is seen."""
+
+    @property
+    def depth_median(self) -> float:
+        """Median absolute residual of depth, relative to the depth; NaN if no point is seen."""
+
+
+class Aligner(Protocol[ImageT]):
+    """The operations of direct alignment.
+
+    Images are brightness [H, W] in [0, 1] and depth [H, W] in metres, NaN where there is none.
+    """
+
+    def layers(self, brightness: ImageT, depth: ImageT, max_step: float) -> ImageT:
+        """Returns [H, W, 6 or more]: brightness, its gradients along u and v, depth, its gradients; then padding.
+
+        Gradients are 0 at the border. Depth is NaN where it changes by more than the fraction ``max_step`` from one pixel
+        to the next.
+        """
+
+    def halve(self, brightness: ImageT, depth: ImageT, max_step: float) -> tuple[ImageT, ImageT]:
+        """Returns both images [H // 2, W // 2] as means of 2x2 blocks; depth is NaN where a block spans a depth edge."""
+
+    def linearize(
+        self,
+        brightness: ImageT,
+        depth: ImageT,
+        layers: ImageT,
+        *,
+        camera: PinholeCamera,
+        color_motion: Array,
+        depth_motion: Array,
+        velocity: Array,
+        gain: float,
+        bias: float,
+        photometric_scale: float,
+        depth_scale: float,
+        max_depth_ratio: float,
+        inlier_color: float,
+        inlier_depth: float,
+    ) -> LinearSystem:
+        """Linearises the residuals of a reference in a frame of the same camera.
+
+        Args:
+            brightness: [H, W] of the reference.
+            depth: [H, W] of the reference.
+            layers: [H, W, C] of the frame.
+            camera: the pinhole of both.
+            color_motion: [4, 4] from the reference's camera to the frame's camera at the colour image's time.
+            depth_motion: [4, 4] the same at the depth image's time.
+            velocity: [6] twist by which ``color_motion`` changes per unit of time offset.
+            gain: brightness of the frame = gain * brightness of the reference + bias.
+            bias: see gain.
+            photometric_scale: scale of the residuals of brightness, for Student's t.
+            depth_scale: scale of the residuals of depth, relative to the depth.
+            max_depth_ratio: points whose relative depth differs by more are on another surface.
+            inlier_color: largest residual of brightness of an inlier.
+            inlier_depth: largest residual of depth of an inlier.
+        """

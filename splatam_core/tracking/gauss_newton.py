@@ -1,0 +1,190 @@
+"""Gauss-Newton on photometric and depth residuals, from the coarsest level of a pyramid to the finest."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from splatam_core.config import TrackingConfig
+from splatam_core.geometry import se3
+from splatam_core.geometry.se3 import Matrix
+from splatam_core.tracking.aligner import Aligner, Array, LinearSystem
+from splatam_core.tracking.pyramid import EDGE, Level
+
+_MIN_POINTS = 50
+_SMALL_STEP = 1e-5  # m, rad: converged
+_FIRST_SCALES = 0.1, 0.02  # of residuals: brightness in [0, 1], relative depth
+_MIN_SCALES = 0.004, 0.001  # no sensor is better
+_MAD_TO_DEVIATION = 1.4826  # standard deviation over median absolute deviation, for a normal distribution
+_LEAST_WEIGHT = 1e-6
+_TWIST, _GAIN_AND_BIAS, _TIME_OFFSET = range(6), range(6, 8), range(8, 9)  # the unknowns
+_PRIOR = np.array([0.3] * 6 + [0.1] * 2 + [0.5]) ** -2  # variance^-1 of a step: m and rad; gain, bias; frame intervals
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AlignmentState:
+    """The estimate that alignment refines.
+
+    Attributes:
+        depth_motion: [4, 4] from the reference's camera to the frame's camera at the depth image's time.
+        gain: brightness of the frame = gain * brightness of the reference + bias.
+        bias: see gain.
+        time_offset: frame intervals by which the colour image is later than the depth image.
+        velocity: [6] twist of the camera per frame interval.
+    """
+
+    depth_motion: Matrix
+    gain: float = 1.0
+    bias: float = 0.0
+    time_offset: float = 0.0
+    velocity: Matrix = field(default_factory=lambda: np.zeros(6))
+
+    @property
+    def color_motion(self) -> Matrix:
+        """[4, 4] from the reference's camera to the frame's camera at the colour image's time."""
+        return se3.exp(self.time_offset * self.velocity) @ self.depth_motion if self.time_offset else self.depth_motion
+
+    def moved(self, step: Matrix) -> AlignmentState:
+        """Returns the state after a step [9] of the unknowns."""
+        return AlignmentState(
+            depth_motion=se3.exp(step[:6]) @ self.depth_motion,
+            gain=self.gain + step[6],
+            bias=self.bias + step[7],
+            time_offset=self.time_offset + step[8],
+            velocity=self.velocity,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """A state, and how well the frame agrees with the reference there.
+
+    Attributes:
+        state: the state.
+        system: the residuals at the finest level.
+    """
+
+    state: AlignmentState
+    system: LinearSystem
+
+
+class GaussNewton:
+    """Aligns a frame to a reference render.
+
+    Residuals have Student-t weights with scales from the data (DVO; Kerl, Sturm and Cremers, "Robust Odometry Estimation for
+    RGB-D Cameras", 2013).
+    """
+
+    def __init__(self, aligner: Aligner[Any], config: TrackingConfig) -> None:
+        self._aligner = aligner
+        self._config = config
+        align = config.align
+        exposure, time_offset = _GAIN_AND_BIAS if align.exposure else (), _TIME_OFFSET if align.time_offset else ()
+        self._free = [*_TWIST, *exposure, *time_offset]  # the unknowns to solve for
+
+    def align(self, references: Sequence[Level], frames: Sequence[Level], predicted_motion: Matrix | None) -> Alignment:
+        """Aligns from coarse to fine, starting where the reference was rendered.
+
+        Args:
+            references: pyramid of the render, finest level first.
+            frames: pyramid of the frame, with the same cameras.
+            predicted_motion: [4, 4] from the camera one frame ago to the render's; None if that is not known.
+
+        Returns:
+            The state found, or the start where that explains the finest level better.
+        """
+        start = state = AlignmentState(np.eye(4))
+        scales = _FIRST_SCALES
+        for reference, frame in zip(reversed(references), reversed(frames), strict=True):
+            layers = self._aligner.layers(frame.brightness, frame.depth, EDGE)
+            state, scales = self._iterate(reference, layers, state, scales, predicted_motion)
+        return self._better(
+            Alignment(start, self._linearize(references[0], layers, start, scales)),
+            Alignment(state, self._linearize(references[0], layers, state, scales)),
+        )
+
+    def _iterate(
+        self, reference: Level, layers: Array | Tensor, state: AlignmentState, scales: tuple[float, float],
+        predicted_motion: Matrix | None,
+    ) -> tuple[AlignmentState, tuple[float, float]]:  # fmt: skip
+        """Takes steps at one level until they are small. Returns the state and the scales of the residuals."""
+        for _ in range(self._config.iterations):
+            if predicted_motion is not None:
+                state = replace(state, velocity=se3.log(state.depth_motion @ predicted_motion))
+            system = self._linearize(reference, layers, state, scales)
+            scales = _scales(system)
+            step = _step(system, state, self._free)
+            if step is None:
+                break
+            state = state.moved(step)
+            if np.abs(step[:6]).max() < _SMALL_STEP:
+                break
+        return state, scales
+
+    def _linearize(
+        self, reference: Level, layers: Array | Tensor, state: AlignmentState, scales: tuple[float, float]
+    ) -> LinearSystem:
+        config = self._config
+        weights = config.color_weight, config.depth_weight
+        photometric_scale, depth_scale = (
+            scale / math.sqrt(max(weight, _LEAST_WEIGHT)) for scale, weight in zip(scales, weights, strict=True)
+        )
+        return self._aligner.linearize(
+            reference.brightness,
+            reference.depth,
+            layers,
+            camera=reference.camera,
+            color_motion=state.color_motion.astype(np.float32),
+            depth_motion=state.depth_motion.astype(np.float32),
+            velocity=state.velocity.astype(np.float32),
+            gain=state.gain,
+            bias=state.bias,
+            photometric_scale=photometric_scale,
+            depth_scale=depth_scale,
+            max_depth_ratio=2 * EDGE,
+            inlier_color=config.inlier_color,
+            inlier_depth=config.inlier_depth,
+        )
+
+    def _better(self, start: Alignment, found: Alignment) -> Alignment:
+        """Returns the alignment of lower cost. A point that is not seen costs as much as the average one at the start."""
+        unseen_cost = start.system.cost / max(1, start.system.seen)
+        is_better = 2 * found.system.seen > start.system.seen and (
+            _total_cost(found.system, unseen_cost) < _total_cost(start.system, unseen_cost)
+        )
+        return found if is_better else start
+
+
+def _scales(system: LinearSystem) -> tuple[float, float]:
+    """Returns the scales of the residuals of brightness and depth, from their medians."""
+    return (
+        max(_MIN_SCALES[0], _MAD_TO_DEVIATION * system.photometric_median),
+        max(_MIN_SCALES[1], _MAD_TO_DEVIATION * system.depth_median),
+    )
+
+
+def _step(system: LinearSystem, state: AlignmentState, free: list[int]) -> Matrix | None:
+    """Returns the step [9] of the free unknowns that minimises the residuals; None if they do not determine one.
+
+    On a ramp of brightness a shift looks like a change of bias. The priors decide what the residuals leave open.
+    """
+    if system.seen < _MIN_POINTS:
+        return None
+    H, g = system.H + np.diag(_PRIOR), system.g.copy()
+    g[6:] += _PRIOR[6:] * (state.gain - 1, state.bias, state.time_offset)
+    step = np.zeros(len(g))
+    try:
+        step[free] = -np.linalg.solve(H[np.ix_(free, free)], g[free])
+    except np.linalg.LinAlgError:
+        return None
+    return step
+
+
+def _total_cost(system: LinearSystem, unseen_cost: float) -> float:
+    """Returns the robust cost of all points, with a given cost for each point that is not seen."""
+    return system.cost + unseen_cost * (system.points - system.seen)

@@ -1,0 +1,87 @@
+"""Image pyramids for alignment: brightness and depth at a half, a quarter, ... of the resolution."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.images.filters import brightness, is_on_host, luminance
+from splatam_core.images.view import View
+from splatam_core.rasterizer import Render
+from splatam_core.tracking.aligner import Aligner, Array
+
+EDGE = 0.05
+"""Depth that changes by more than this fraction from one pixel to the next is an edge, not a surface."""
+
+_COARSEST_PX = 32  # smaller images show too little to align
+_DEPTH_LAYER = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Level:
+    """One resolution of an image that is aligned.
+
+    Attributes:
+        camera: its pinhole.
+        brightness: [H, W] in [0, 1]; an array on the host, else a tensor.
+        depth: [H, W] metres; NaN where there is none.
+    """
+
+    camera: PinholeCamera
+    brightness: Array | Tensor
+    depth: Array | Tensor
+
+
+def frame_level(view: View) -> Level:
+    """Returns a frame at its full resolution."""
+    if not is_on_host(view.depth):
+        return Level(view.camera, brightness(view.rgb8), torch.where(view.valid, view.depth, torch.nan))
+    depth = np.where(view.valid, view.depth, np.float32(np.nan))
+    return Level(view.camera, _brightness(view.rgb8.numpy().astype(np.float32) / np.float32(255)), depth)
+
+
+def render_level(render: Render, camera: PinholeCamera, silhouette_threshold: float) -> Level:
+    """Returns a render at its full resolution, with depth where the silhouette is above the threshold."""
+    visible = render.silhouette > silhouette_threshold
+    if not is_on_host(render.rgb):
+        return Level(camera, luminance(render.rgb.permute(1, 2, 0)), torch.where(visible, render.depth(), torch.nan))
+    depth = np.where(visible.numpy(), render.depth().numpy(), np.float32(np.nan))
+    return Level(camera, _brightness(np.ascontiguousarray(render.rgb.permute(1, 2, 0).numpy())), depth)
+
+
+def half_pyramid(level: Level, aligner: Aligner[Any]) -> list[Level]:
+    """Returns a level at a half, a quarter, ... of its resolution, finest first; the level itself if it is too small.
+
+    The full resolution is left out: it would be three quarters of the work.
+    """
+    return list(_halved(level, aligner)) or [level]
+
+
+def full_pyramid(level: Level, aligner: Aligner[Any]) -> list[Level]:
+    """Returns a level, without depth at depth edges, and at a half, a quarter, ... of its resolution.
+
+    A render blends the depths on both sides of an edge. ``half_pyramid`` removes them when it halves the first time.
+    """
+    depth = aligner.layers(level.brightness, level.depth, EDGE)[..., _DEPTH_LAYER]
+    finest = replace(level, depth=depth if isinstance(depth, Tensor) else np.ascontiguousarray(depth))
+    return [finest, *_halved(finest, aligner)]
+
+
+def _halved(level: Level, aligner: Aligner[Any]) -> Iterator[Level]:
+    while min(level.camera.width, level.camera.height) >= 2 * _COARSEST_PX:
+        width, height = level.camera.width // 2, level.camera.height // 2
+        camera = level.camera.cropped(2 * width, 2 * height).resized(width, height)
+        level = Level(camera, *aligner.halve(level.brightness, level.depth, EDGE))
+        yield level
+
+
+def _brightness(rgb: Array) -> Array:
+    """Returns [H, W] luminance of colours [H, W, 3]."""
+    return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32, copy=False)
