@@ -69,11 +69,14 @@ class Plan:
     settings: tuple[str, ...] = ()
 
 
-GPU = Plan('cuda', 'triton', ((640, 480), (1200, 680)), (300_000, 1_000_000, 3_000_000), 20, MAX_FRAMES)
+GPU = Plan(
+    device='cuda', rasterizer='triton', sizes=((640, 480), (1200, 680)), counts=(300_000, 1_000_000, 3_000_000), runs=20,
+    frames=MAX_FRAMES,
+)  # fmt: skip
 TRIAL = Plan(
-    'cpu', 'triton', ((32, 24),), (100,), 1, 3,
-    ('tracking.iterations=2', 'mapping.iterations=2', 'mapping.first_iterations=2', 'tracking.silhouette_threshold=0.5',
-     'mapping.prune_scale=1.0'),
+    device='cpu', rasterizer='triton', sizes=((32, 24),), counts=(100,), runs=1, frames=3,
+    settings=('tracking.iterations=2', 'mapping.iterations=2', 'mapping.first_iterations=2', 'tracking.silhouette_threshold=0.5',
+              'mapping.prune_scale=1.0'),
 )  # fmt: skip
 
 
@@ -133,7 +136,7 @@ def gsplat(cam: PinholeCamera) -> Draw | None:
         turned = gaussians.anisotropic()
         images, alphas, _ = rasterization(
             turned.means, turned.rotations, turned.log_scales.exp(), torch.sigmoid(turned.logit_opacities), turned.rgb,
-            pose[None], K[None], cam.width, cam.height, near_plane=0.2, render_mode='RGB+D', packed=False,
+            viewmats=pose[None], Ks=K[None], width=cam.width, height=cam.height, near_plane=0.2, render_mode='RGB+D', packed=False,
         )  # fmt: skip
         return [images, alphas]
 
