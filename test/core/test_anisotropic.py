@@ -1,4 +1,4 @@
-"""SLAM with anisotropic Gaussians: the map, its optimiser, files and loading; rendering is the contract test's."""
+"""SLAM with anisotropic Gaussians: map, optimizer, files and loading. The contract test covers rendering."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def mapped() -> Slam:
 
 
 def test_radii_and_rotations_are_fitted(mapped: Slam) -> None:
-    """They start equal and upright, and do not stay so."""
+    """Scales start equal and rotations at the identity; both change."""
     snapshot = mapped.snapshot()
     assert snapshot.log_scales.shape == (mapped.num_gaussians, 3)
     assert snapshot.rotations.shape == (mapped.num_gaussians, 4)
@@ -55,7 +55,7 @@ def test_radii_and_rotations_are_fitted(mapped: Slam) -> None:
 
 
 def test_a_map_goes_on_from_its_file(mapped: Slam, tmp_path: Path) -> None:
-    """Through the PLY it renders the same; a configuration of the other kind refuses it, or takes up an isotropic one."""
+    """A map read from its PLY renders the same. An isotropic configuration refuses it; an anisotropic one takes isotropic maps."""
     write_ply(tmp_path / 'map.ply', mapped.map.gaussians)
     gaussians = read_ply(tmp_path / 'map.ply')
     again = Slam(load_config('quick', SETTINGS))
@@ -69,7 +69,7 @@ def test_a_map_goes_on_from_its_file(mapped: Slam, tmp_path: Path) -> None:
 
 
 def test_the_optimiser_follows_what_is_kept() -> None:
-    """Rotations move, and their moments go with their Gaussians."""
+    """Rotations change, and their moments stay with their Gaussians."""
     gaussian_map = GaussianMap(anisotropic=True)
     gaussian_map.append(isotropic(6))
     gaussian_map.start_optimization(Rates(0.0, 0.0, 0.0, 0.0, rotations=0.01))
@@ -81,7 +81,7 @@ def test_the_optimiser_follows_what_is_kept() -> None:
         kept = torch.ones(len(gaussian_map), dtype=torch.bool)
     gaussian_map.stop_optimization()
     assert len(gaussian_map) == 4
-    # Adam's steps have the rate's size, about, whatever the slope
+    # Adam's steps are about as long as the rate, whatever the gradient
     torch.testing.assert_close(gaussian_map.rotations[:, 1], torch.full((4,), -0.02), rtol=0.1, atol=0)
     assert torch.equal(gaussian_map.rotations[:, 0], torch.ones(4))
     assert gaussian_map.gaussians.bounds[0, 6] == gaussian_map.log_scales.max()

@@ -34,7 +34,7 @@ def test_resized_image_matches_resized_camera() -> None:
 
 
 def test_depth_is_resized_without_mixing() -> None:
-    """No reading appears that was not there."""
+    """Rectification does not invent readings."""
     depth = np.random.default_rng(0).choice([0.0, 1.0, 3.0], size=(48, 64)).astype(np.float32)
     frame = FrameFactory(CameraCalibration(CAMERA), width=40).make(1, np.zeros((48, 64, 3), np.uint8), depth)
     assert set(np.unique(frame.depth_m)) <= {0.0, 1.0, 3.0}
@@ -50,7 +50,7 @@ def test_depth_is_resized_without_mixing() -> None:
     ],
 )
 def test_rectified_pixels_see_straight(model: str, coefficients: tuple[float, ...]) -> None:
-    """A distorted image of a smooth pattern, rectified, is the pattern as a pinhole sees it."""
+    """A distorted image of a smooth pattern, rectified, is the pattern seen by a pinhole."""
     camera = PinholeCamera(160, 120, 130.0, 131.0, 80.2, 59.1)
     u, v = np.meshgrid(np.arange(160.0), np.arange(120.0))
     pixels = np.stack([u, v], -1).reshape(-1, 1, 2)
@@ -92,7 +92,7 @@ def test_depth_of_another_resolution_is_brought_to_colour_s(size: tuple[int, int
     v, u = np.mgrid[:height, :width].astype(np.float32)
     depth = 1 + 1000 * v + u
     frame = FrameFactory(CameraCalibration(CAMERA)).make(1, np.zeros((48, 64, 3), np.uint8), depth)
-    assert frame.depth_m.shape == (48, 64) and set(frame.depth_m.flat) <= set(depth.flat)  # nothing is mixed
+    assert frame.depth_m.shape == (48, 64) and set(frame.depth_m.flat) <= set(depth.flat)  # no reading is interpolated
     # A pixel's centre is its integer index: the nearest centre of the other grid, at most half a pixel of it away.
     y, x = (np.indices((48, 64)) + 0.5) * np.array([height / 48, width / 64])[:, None, None] - 0.5
     found_v, found_u = np.divmod(frame.depth_m - 1, 1000)

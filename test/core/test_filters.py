@@ -1,4 +1,4 @@
-"""Filters in torch against OpenCV's, which the host uses."""
+"""Filters in torch against those of OpenCV, which the host uses."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_blur_and_box_equal_opencvs(size: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize(('width', 'height'), [(32, 24), (35, 26), (61, 47), (64, 48), (1, 1)])
 def test_resizing_equals_opencvs(width: int, height: int) -> None:
-    """Depth exactly; colours to the one step of 255 that ties may be rounded to the other way."""
+    """Depth is exact; colours may differ by 1 of 255, because ties are rounded differently."""
     rgb8 = torch.randint(0, 256, (48, 64, 3), generator=GENERATOR, dtype=torch.uint8)
     depth = _random(48, 64)
     difference = filters.shrunk_by_torch(rgb8, width, height).int() - filters.shrunk(rgb8, width, height).int()

@@ -33,14 +33,14 @@ def test_tracking_loss_sums_where_the_map_is_sure_and_depth_is_read() -> None:
     silhouette = torch.zeros(4, 6)
     silhouette[:, :3] = 1.0
     loss = tracking_loss(_render(0.5, 2.3, silhouette), _view(), TrackingConfig())
-    pixels = 3 * 3  # three columns sure, three rows with depth
+    pixels = 3 * 3  # three opaque columns, three rows with depth
     assert loss.num_pixels == pixels
     assert float(loss.total) == pytest.approx(pixels * (1.0 * 0.3 + 0.5 * 3 * 0.1), rel=1e-5)
 
 
 def test_tracking_loss_without_the_silhouette_takes_colour_from_everywhere() -> None:
     render = _render(0.5, 2.3, torch.ones(4, 6))
-    render.silhouette[:, :3] = 0.6  # not sure
+    render.silhouette[:, :3] = 0.6  # below the threshold
     loss = tracking_loss(render, _view(), TrackingConfig(paper=PaperTrackingConfig(use_silhouette=False)))
     assert loss.num_pixels == 3 * 6  # three rows with depth
     depth = 3 * 3 * (0.3 + 2.3 / 0.6 - 2.0)

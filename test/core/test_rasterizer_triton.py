@@ -1,6 +1,6 @@
-"""What is the Triton backend's own: room for tile lists, the pose-only path, what it refuses, and that the compiler takes it.
+"""The Triton backend: capacity of tile lists, the pose-only path, what it refuses, and that its kernels compile.
 
-The contract, and agreement with the reference, is in ``test_rasterizer_contract.py``.
+The contract, and agreement with the reference, are in ``test_rasterizer_contract.py``.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ RATES = Rates(means=1e-4, log_scales=1e-3, logit_opacities=0.05, rgb=2.5e-3)
 SCENE = scenes.random_scene(51, 90, 26, 19)
 
 
-class Room(Capacity):
-    """Always the same room, enough or not."""
+class FixedCapacity(Capacity):
+    """Always the same capacity, sufficient or not."""
 
     def __init__(self, entries: int) -> None:
         super().__init__()
@@ -60,24 +60,24 @@ def _pose_gradient(rasterizer: TritonRasterizer, scene: Scene, wants_means: bool
 
 
 def test_the_pose_alone_gets_the_gradient_that_it_gets_beside_the_map() -> None:
-    """Summed pixel by pixel, or Gaussian by Gaussian: the same to float32. The last row is constant."""
+    """Summed by pixel or by Gaussian: the same to float32. The last row is constant."""
     beside, alone = (_pose_gradient(TritonRasterizer(), SCENE, wants_means) for wants_means in (True, False))
     assert float((alone - beside).abs().max()) < 1e-5 * float(beside.abs().max())
     assert not alone[3].any() and alone[:3].all()
 
 
-def test_lists_without_room_change_nothing_but_the_time() -> None:
-    """Image, gradients by map and pose, and a fitting step, where not one tile's list is whole."""
-    roomy, cramped = TritonRasterizer(), TritonRasterizer(capacity=Room(16))
-    image, gradients = scenes.render_with_gradients(roomy, SCENE, torch.float32, _weights(SCENE), DEVICE)
-    same_image, same_gradients = scenes.render_with_gradients(cramped, SCENE, torch.float32, _weights(SCENE), DEVICE)
+def test_lists_beyond_their_capacity_change_nothing_but_the_time() -> None:
+    """Image, gradients by map and pose, and a fitting step, where no tile's list is complete."""
+    enough, too_small = TritonRasterizer(), TritonRasterizer(capacity=FixedCapacity(16))
+    image, gradients = scenes.render_with_gradients(enough, SCENE, torch.float32, _weights(SCENE), DEVICE)
+    same_image, same_gradients = scenes.render_with_gradients(too_small, SCENE, torch.float32, _weights(SCENE), DEVICE)
     torch.testing.assert_close(same_image, image, rtol=0, atol=1e-5)
     for name, gradient in gradients.items():
         assert float((same_gradients[name] - gradient).abs().max()) < 5e-5 * float(gradient.abs().max()), name
-    alone = _pose_gradient(cramped, SCENE, wants_means=False)
+    alone = _pose_gradient(too_small, SCENE, wants_means=False)
     assert float((alone[:3] - gradients['T_cam_world']).abs().max()) < 5e-5 * float(gradients['T_cam_world'].abs().max())
-    loss, first = _fit(roomy, SCENE)
-    same_loss, same_first = _fit(cramped, SCENE)
+    loss, first = _fit(enough, SCENE)
+    same_loss, same_first = _fit(too_small, SCENE)
     assert same_loss == pytest.approx(loss, rel=1e-5)
     # Residuals near zero take the sign of their gradient from rounding.
     assert float((same_first - first).abs().max()) < 1e-3 * float(first.abs().max())
@@ -101,18 +101,18 @@ def _target(scene: Scene) -> Target:
     return Target(camera, rgb8, depth, scene.T_cam_world.float(), 0.5, 1.0)
 
 
-def test_room_is_two_fifths_more_than_was_seen_and_is_learned_a_view_later() -> None:
-    """The first view is waited for; growth shows on the view after; a much larger map is waited for again."""
+def test_capacity_is_two_fifths_more_than_was_needed_and_follows_one_view_later() -> None:
+    """The host waits for the first view, and for a much larger map; growth shows one view later."""
     capacity = Capacity()
 
-    def room(entries: int, gaussians: int = 1000) -> int:
+    def chosen(entries: int, gaussians: int = 1000) -> int:
         return capacity.of(torch.tensor([entries]), gaussians, 100)  # tensors of the CPU arrive at once
 
-    assert room(10_000) == 14_000
-    assert room(15_000) == 14_000 and room(15_000) == 21_000
-    assert room(20_000) == 21_000 and room(20_000) == 28_000
-    assert room(100_000, gaussians=1300) == 140_000
-    steady = [room(10_000, gaussians=1300) for _ in range(300)]
+    assert chosen(10_000) == 14_000
+    assert chosen(15_000) == 14_000 and chosen(15_000) == 21_000
+    assert chosen(20_000) == 21_000 and chosen(20_000) == 28_000
+    assert chosen(100_000, gaussians=1300) == 140_000
+    steady = [chosen(10_000, gaussians=1300) for _ in range(300)]
     assert steady[0] == 140_000 and steady[-1] < 31_000  # memory is given back in time
 
 
@@ -145,7 +145,7 @@ def test_equal_depths_keep_the_order_of_the_map() -> None:
 
 
 def test_bounds_grow_with_what_is_fitted() -> None:
-    """So that a map can go back to a rasterizer which skips what is out of view."""
+    """So that the map can be given to a rasterizer that skips blocks out of view."""
     gaussians = GaussianMap()
     gaussians.append(scenes.on_device(SCENE.gaussians, 'cpu'))
     g = gaussians.gaussians

@@ -54,7 +54,7 @@ def test_interpolation_ends_at_its_ends(twist: np.ndarray, fraction: float) -> N
 
 
 def test_small_angles_meet_the_closed_form() -> None:
-    """The series and the closed form agree where one takes over from the other."""
+    """The series and the closed form agree at the angle where they switch."""
     for angle in (0.9e-5, 1.1e-5):
         twist = np.array([0.3, -0.2, 0.5, angle, 0, 0])
         np.testing.assert_allclose(se3.log(se3.exp(twist)), twist, atol=1e-9)

@@ -1,4 +1,4 @@
-"""The whole SLAM by the Triton rasterizer: on a GPU where there is one, else its kernels interpreted on small frames."""
+"""The whole SLAM with the Triton rasterizer: on a GPU if there is one, else with interpreted kernels on small frames."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ FEW_STEPS = (
     'mapping.first_iterations=3', 'mapping.iterations=1', 'keyframes.every=2', 'mapping.prune_scale=1.0',
     'tracking.silhouette_threshold=0.7', 'tracking.min_visible_fraction=0.1', 'tracking.iterations=8',
 )  # fmt: skip
-# Metres and radians: a fifth of a pixel. Alignment of so few points is decided by those on the border, which a rounding takes
-# in or leaves out. Where there are enough it is far closer, see below; for the paper's tracker see test_rasterizer_triton.py.
+# Metres and radians: a fifth of a pixel. With so few points, alignment depends on those on the border, which rounding includes or
+# excludes. With more points it is far closer, see below; for the paper's tracker see test_rasterizer_triton.py.
 TOLERANCE = 1e-2
 
 
@@ -35,7 +35,7 @@ def _config(rasterizer: str) -> SlamConfig:
 
 @pytest.mark.slow
 def test_ten_frames_of_realtime_are_those_of_the_native_rasterizer(room: Room) -> None:
-    """Each from the same state, which moves between the two without loss: the same frames tracked, as many Gaussians."""
+    """Each starts from the same state, which moves between the two without loss: equal statuses and numbers of Gaussians."""
     sequence = room(10, WIDTH, noise=False)
     native, triton = Slam(_config('cpu')), Slam(_config('triton'))
     for index in range(10):
