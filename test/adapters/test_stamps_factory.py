@@ -5,9 +5,11 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
 
 from msg_adapters import stamps
 from msg_adapters.errors import MessageError
+from msg_adapters.factory import RosbagsMessages
 
 
 @given(st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
@@ -31,6 +33,21 @@ def test_a_header_keeps_stamp_and_frame(factory):
     )
     assert stamps.message_stamp_ns(pose) == 1_305_031_102_175_304_000
     assert pose.header.frame_id == 'camera'
+
+
+@pytest.mark.parametrize('is_little_endian', [True, False])
+def test_the_stamp_of_a_serialized_message_is_read_without_decoding_it(is_little_endian):
+    typestore = get_typestore(Stores.ROS2_JAZZY)
+    factory = RosbagsMessages(typestore)
+    point = factory.make(
+        'geometry_msgs/msg/PointStamped',
+        header=stamps.header(factory, -1_304_031_102_175_304_001, 'camera'),
+        point=factory.make('geometry_msgs/msg/Point', x=0.0, y=0.0, z=0.0),
+    )
+    data = typestore.serialize_cdr(point, 'geometry_msgs/msg/PointStamped', little_endian=is_little_endian)
+    assert stamps.serialized_stamp_ns(bytes(data)) == -1_304_031_102_175_304_001
+    with pytest.raises(MessageError, match='has 11 bytes, too few for a header'):
+        stamps.serialized_stamp_ns(bytes(data)[:11])
 
 
 @pytest.mark.parametrize('type_name', ['no_such_msgs/msg/Thing', 'std_msgs/msg/NoSuchMessage', 'nonsense'])

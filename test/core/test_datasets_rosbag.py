@@ -10,6 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from msg_adapters import camera_info, images, poses
 from msg_adapters.factory import RosbagsMessages
+from splatam_core.datasets.bag.recording import Recording
 from splatam_core.datasets.base import BagTopics
 from splatam_core.datasets.convert import write_bag
 from splatam_core.datasets.registry import open_sequence
@@ -281,6 +282,31 @@ def test_messages_recorded_at_the_same_time(tmp_path, storage):
         messages += [('/rgb', 5 * SECOND, color(stamp, np.full_like(RGB, i))), ('/depth', 5 * SECOND, depth(stamp))]
     read = open_sequence(str(make_bag(tmp_path / 'bag', messages, storage)))
     assert [int(read[i].rgb[0, 0, 0]) for i in (4, 0, 3, 1, 2)] == [4, 0, 3, 1, 2]
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_iterations_over_messages_do_not_disturb_each_other(tmp_path, storage):
+    """Two at the same time, with jumps between chunks of 1 MB; and the files are kept open for the next iteration."""
+    write_bag(Frames([(i + 1) * 33 * MS for i in range(30)], 1000.0, size=(96, 128)), tmp_path / 'bag', storage=storage)
+    with Recording(tmp_path / 'bag') as recording:
+        expected = [message.data for message in recording.messages(['/rgb/image'])]
+        assert len(set(expected)) == 30
+        first = recording.messages(['/rgb/image'])
+        seen = [next(first).data for _ in range(3)]
+        last = [message.data for message in recording.messages(['/rgb/image'], start_ns=28 * 33 * MS)]
+        assert last == expected[27:]
+        assert seen + [message.data for message in first] == expected
+
+
+def test_what_a_recording_says_about_its_topics(tmp_path):
+    bag = make_bag(tmp_path / 'bag', [*rgbd(SECOND), *rgbd(3 * SECOND)])
+    with Recording(bag) as recording:
+        assert (recording.start_ns, recording.end_ns, recording.duration_s) == (SECOND, 3 * SECOND, 2.0)
+        topic = recording.topics['/camera/depth/image_raw']
+        assert (topic.type_name, topic.is_image, topic.num_messages) == ('sensor_msgs/msg/Image', True, 2)
+        assert recording.encoding(topic.name) == '16UC1'
+        assert [recording.is_depth(name) for name in ('/camera/depth/image_raw', '/camera/color/image_raw')] == [True, False]
+        assert recording.topics_of('sensor_msgs/msg/CameraInfo') == ['/camera/color/camera_info']
 
 
 # --- pairing ---
