@@ -107,6 +107,7 @@ def test_every_instruction_set_equals_reference(isa: str, monkeypatch: pytest.Mo
     if rasterizer.instruction_set != isa:
         pytest.skip(f'this processor runs {rasterizer.instruction_set}, not {isa}')
     _assert_equals_reference(rasterizer, SCENES['odd size'])
+    _assert_fits_like_the_reference(rasterizer, SCENES['odd size'])
 
 
 def test_a_missing_native_module_is_said_where_it_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,8 +156,12 @@ def _fitted(
 @pytest.mark.parametrize(('name', 'backend', 'threads'), _cases(FITTED))
 def test_fitting_steps_equal_the_reference(name: str, backend: str, threads: int) -> None:
     """Five steps of rendering, Huber's loss and Adam in native code, against the same written with autograd."""
-    expected, expected_moments, expected_losses = _fitted(ReferenceRasterizer(), SCENES[name], 5)
-    actual, moments, losses = _fitted(make_rasterizer(backend, threads), SCENES[name], 5, scenes.device_of(backend))
+    _assert_fits_like_the_reference(make_rasterizer(backend, threads), SCENES[name], scenes.device_of(backend))
+
+
+def _assert_fits_like_the_reference(rasterizer: Rasterizer, scene: Scene, device: str = 'cpu') -> None:
+    expected, expected_moments, expected_losses = _fitted(ReferenceRasterizer(), scene, 5)
+    actual, moments, losses = _fitted(rasterizer, scene, 5, device)
     assert losses == pytest.approx(expected_losses, rel=1e-5, abs=1e-7)  # float32 sums over the image
     assert losses == sorted(losses, reverse=True)
     # Adam makes full steps of the faintest gradients, so values are compared by what they lead to (the losses); the

@@ -17,6 +17,7 @@ from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.images.view import View
 from splatam_core.rasterizer import make_rasterizer
+from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.rasterizer.native import make_native_aligner
 from splatam_core.slam import Slam
 from splatam_core.tracking import TorchAligner, alignment, make_tracker
@@ -71,12 +72,18 @@ def test_layers_and_halving_are_the_native_ones(size: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize('time_offset', [0.0, 0.3])
 @pytest.mark.parametrize('size', [(48, 65), (120, 160)])
-def test_linear_system_is_the_native_one(size: tuple[int, int], time_offset: float) -> None:
-    """With NaN depth, steps, another exposure, and a time offset between colour and depth.
+@pytest.mark.parametrize('isa', ['generic', 'avx2', 'avx512'])
+def test_linear_system_is_the_native_one(
+    isa: str, size: tuple[int, int], time_offset: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With NaN depth, steps, another exposure, and a time offset between colour and depth; by every instruction set there is.
 
     Sums of float32 against sums of doubles over up to 19 200 pixels: 1e-5 of the largest entry. Counts may differ by the few
     points that fall on a limit, and medians by a bin (an eighth of an octave) where many lie around its edge.
     """
+    monkeypatch.setenv('SPLATAM_ISA', isa)
+    if (runs := CpuRasterizer(1).instruction_set) != isa:
+        pytest.skip(f'this processor runs {runs}, not {isa}')
     reference, frame = _picture(2, size), _picture(3, size)
     frame = 1.1 * reference[0] + 0.2 * frame[0], np.float32(0.5) * (reference[1] + frame[1])
     native, ours = make_native_aligner(1), TorchAligner()
