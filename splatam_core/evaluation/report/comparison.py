@@ -39,18 +39,18 @@ class _Run:
 
 def comparison_table(runs: Sequence[RunRecord]) -> str:
     """Return a Markdown table with one run per line, below a line with what the runs have in common."""
-    named = _named(runs)
+    labelled = _labelled(runs)
     commits = {run.commit or 'unknown' for run in runs}
     sources = {_source(run) for run in runs}
     columns = [
-        ('run', [run.label for run in named]),
+        ('run', [run.label for run in labelled]),
         *([('source', [_source(run) for run in runs])] if len(sources) > 1 else []),
         *([('commit', [(run.commit or 'unknown')[:10] for run in runs])] if len(commits) > 1 else []),
         ('preset', [run.description.preset or 'none' for run in runs]),
-        ('tracked', [f'{run.metrics.tracked}/{run.metrics.frames}' for run in named]),
+        ('tracked', [f'{run.metrics.tracked}/{run.metrics.frames}' for run in labelled]),
     ]
     for name in COLUMNS:
-        cells = [BY_NAME[name].text(run.metrics) for run in named]
+        cells = [BY_NAME[name].text(run.metrics) for run in labelled]
         if any(cell != '\u2013' for cell in cells):
             columns.append((_heading(BY_NAME[name]), cells))
     return '\n'.join([_in_common(runs, sources, commits), '', *_markdown(columns)])
@@ -76,7 +76,7 @@ def _source(run: RunRecord) -> str:
     return 'live topics' if source is None else source.path
 
 
-def _named(runs: Sequence[RunRecord]) -> list[_Run]:
+def _labelled(runs: Sequence[RunRecord]) -> list[_Run]:
     """Label each run with its folder's name, or with the folder's path if two runs have the same name."""
     names = [run.path.resolve().name for run in runs]
     labels = [name if names.count(name) == 1 else str(run.path) for name, run in zip(names, runs)]
@@ -99,19 +99,19 @@ def _markdown(columns: Sequence[tuple[str, list[str]]]) -> list[str]:
 
 def draw_comparison(runs: Sequence[RunRecord]) -> Figure:
     """Draw bars of the most important numbers; below them the paths from above, time per frame and map size."""
-    named = _named(runs)
-    bars_in = 0.75 + 0.28 * len(named)
+    labelled = _labelled(runs)
+    bars_in = 0.75 + 0.28 * len(labelled)
     with matplotlib.rc_context(LIGHT.style()):
         figure = Figure(figsize=(15, bars_in + 4.6), facecolor=LIGHT.card, layout='constrained')
         FigureCanvasAgg(figure)
         above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[bars_in, 4.6])[:, 0]
-        shown = [name for name in BARS if any(run.metrics.values()[name] is not None for run in named)]
+        shown = [name for name in BARS if any(run.metrics.values()[name] is not None for run in labelled)]
         for index, (ax, name) in enumerate(zip(above.subplots(1, len(shown), squeeze=False)[0], shown)):
-            _bars(ax, named, BY_NAME[name], with_labels=index == 0)
+            _bars(ax, labelled, BY_NAME[name], with_labels=index == 0)
         path, times, size = below.subplots(1, 3)
-        _paths(path, named)
-        _times(times, named)
-        _sizes(size, named)
+        _paths(path, labelled)
+        _times(times, labelled)
+        _sizes(size, labelled)
     return figure
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from splatam_core.runs.metrics import Metrics
@@ -71,7 +72,7 @@ def _original_scores(prefix: str) -> list[Description]:
     ]  # fmt: skip
 
 
-DESCRIPTIONS: dict[str, tuple[Description, ...]] = {
+DESCRIPTIONS: dict[str, Sequence[Description]] = {
     'Run': (
         Description('frames', 'frames', '', 1, ',d', 'Frames processed.'),
         Description('tracked', 'tracked', '', 1, ',d', 'Frames with a pose, including the first.'),
