@@ -27,7 +27,7 @@ PUBLISHER = """
 import sys, time
 from dataclasses import replace
 from pathlib import Path
-sys.path.insert(0, 'test/ros')
+sys.path[:0] = ['test', 'test/ros']
 from camera import Camera
 from graph import Graph
 from splatam_core.datasets.synthetic import SyntheticSequence
