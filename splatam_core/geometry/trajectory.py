@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from splatam_core.errors import DatasetError
 from splatam_core.geometry import se3
 
-MAX_TRUTH_GAP_NS = 500_000_000
+MAX_GROUND_TRUTH_GAP_NS = 500_000_000
 """A stamp between two true poses further apart than this has no true pose: frames there are not scored."""
 
 STAMP_ROUNDING_NS = 1_000_000
@@ -77,7 +77,7 @@ def interpolate_centres(truth: Trajectory, stamps_ns: NDArray[np.int64]) -> tupl
     above, below = truth.stamps_ns[np.minimum(after, last)], truth.stamps_ns[np.clip(after - 1, 0, last)]
     inside = (stamps_ns >= truth.stamps_ns[0]) & (stamps_ns <= truth.stamps_ns[-1])
     nearest_ns = np.minimum(np.abs(above - stamps_ns), np.abs(stamps_ns - below))
-    return centres, (inside & (above - below <= MAX_TRUTH_GAP_NS)) | (nearest_ns <= STAMP_ROUNDING_NS)
+    return centres, (inside & (above - below <= MAX_GROUND_TRUTH_GAP_NS)) | (nearest_ns <= STAMP_ROUNDING_NS)
 
 
 def _interpolated_rotation(truth: Trajectory, stamp_ns: int) -> NDArray[np.float64]:

@@ -16,7 +16,13 @@ from splatam_core.evaluation.trajectory import (
     transformed,
 )
 from splatam_core.geometry import se3
-from splatam_core.geometry.trajectory import MAX_TRUTH_GAP_NS, STAMP_ROUNDING_NS, Trajectory, interpolate_centres, interpolate_poses
+from splatam_core.geometry.trajectory import (
+    MAX_GROUND_TRUTH_GAP_NS,
+    STAMP_ROUNDING_NS,
+    Trajectory,
+    interpolate_centres,
+    interpolate_poses,
+)
 
 EPOCH_NS = 1_700_000_000_123_456_789
 STEP_NS = 33_333_333
@@ -118,7 +124,7 @@ def test_frames_without_ground_truth_are_not_scored() -> None:
     ground_truth = wandering(100)
     keep = np.r_[10:40, 60:90]
     partial = Trajectory(ground_truth.stamps_ns[keep], ground_truth.T_world_cam[keep])
-    assert ground_truth.stamps_ns[60] - ground_truth.stamps_ns[39] > MAX_TRUTH_GAP_NS
+    assert ground_truth.stamps_ns[60] - ground_truth.stamps_ns[39] > MAX_GROUND_TRUTH_GAP_NS
     wild = moved(ground_truth, np.where(np.isin(np.arange(100), keep), 0.0, 50.0)[:, None])
     error = trajectory_error(wild, partial)
     np.testing.assert_array_equal(error.stamps_ns, partial.stamps_ns)
