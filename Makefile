@@ -72,12 +72,12 @@ test-quick: setup
 # Runs every check, also after one has failed, and names those that failed.
 lint: setup $(VENV)/.docs
 	@failed=()
-	check() { echo "== $$*"; "$(BIN)/$$1" "$${@:2}" || failed+=("$$1 $$2"); }
-	check ruff check --quiet .
-	check ruff format --quiet --check .
-	check mypy --no-error-summary
-	check codespell
-	check clang-format --dry-run --Werror $(CSRC)
+	check() { echo "== $$1"; "$(BIN)/$$2" "$${@:3}" || failed+=("$$1"); }
+	check 'ruff check' ruff check --quiet .
+	check 'ruff format' ruff format --quiet --check .
+	check mypy mypy --no-error-summary
+	check codespell codespell
+	check clang-format clang-format --dry-run --Werror $(CSRC)
 	if (( $${#failed[@]} )); then printf 'make lint: failed: %s\n' "$$(IFS=,; echo "$${failed[*]}")" >&2; exit 1; fi
 
 format: setup
