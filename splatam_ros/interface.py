@@ -53,7 +53,8 @@ INPUTS = (
 )  # fmt: skip
 
 OUTPUTS = (
-    Topic('~/processed', 'std_msgs/msg/Header', 'stamp of a frame that is completely processed, skipped or refused', 'with every frame, also lost ones'),
+    Topic('~/processed', 'std_msgs/msg/Header', 'stamp of a frame for which nothing more is published',
+          'with every frame, also lost ones'),
     Topic('/tf', 'tf2_msgs/msg/TFMessage', 'see Frames', 'with every pose, if `publish_tf`'),
     Topic('/tf_static', 'tf2_msgs/msg/TFMessage', 'base to camera, from `camera_in_base`; latched',
           'with the first pose, if `publish_tf` and no one else publishes it'),

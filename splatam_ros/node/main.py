@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
-from splatam_core.settings import Setting
 from splatam_core.errors import SplatamError
+from splatam_core.settings import Setting
 from splatam_ros.node.node import SplatamNode
 from splatam_ros.node.parameters import NODE_SETTINGS
 from splatam_ros.process import StopRequest, ros, split_arguments
