@@ -1,4 +1,4 @@
-"""The two libraries whose messages the adapters speak; every test that takes ``factory`` runs with both."""
+"""The two libraries whose messages are supported; every test that takes ``factory`` runs with both."""
 
 from __future__ import annotations
 

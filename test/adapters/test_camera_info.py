@@ -159,7 +159,7 @@ def test_binning_that_leaves_nothing_is_an_error(info):
 
 
 def test_the_camera_of_rectified_images_is_p(info):
-    """An image_rect topic: D is the lens's still, but the images are bent straight already, to P."""
+    """With an image_rect topic, D still describes the lens, but the images are already rectified to P."""
     p = [400.0, 0.0, 310.0, 0.0, 0.0, 410.0, 230.0, 0.0, 0.0, 0.0, 1.0, 0.0]
     message = info(d=[0.1, -0.2, 0.0, 0.0, 0.0], p=p, binning_x=2)
     camera = parameters(message, is_rectified=True)

@@ -1,4 +1,4 @@
-"""Images to messages and back; messages as drivers send them, and broken ones."""
+"""Images to messages and back; messages as drivers send them, and invalid ones."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def smooth_rgb(height=48, width=64):
 
 
 def raw_message(factory, pixels, encoding, *, padding=0, big_endian=False):
-    """An Image as a driver might send it: any byte order, rows padded with junk."""
+    """An Image as a driver might send it: any byte order, rows padded with arbitrary bytes."""
     height, width = pixels.shape[:2]
     ordered = pixels.astype(pixels.dtype.newbyteorder('>' if big_endian else '<'))
     rows = np.frombuffer(ordered.tobytes(), np.uint8).reshape(height, -1)
@@ -100,7 +100,7 @@ def test_messages_survive_cdr():
 
 
 def test_messages_of_one_library_are_the_other_ones_bytes():
-    """The node gets from the graph what the player read from a bag that rosbags wrote."""
+    """A message that rosbags wrote and the player published reaches the node unchanged."""
     sensor_msgs = pytest.importorskip('sensor_msgs.msg')
     serialization = pytest.importorskip('rclpy.serialization')
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -163,7 +163,7 @@ def test_millimetres_in_any_byte_order_and_padding(factory, encoding, padding, b
 
 
 def test_counts_of_another_length(factory):
-    """TUM's recordings have 5000 a metre."""
+    """TUM's recordings have 5000 counts per metre."""
     counts = np.array([[0, 1, 5000, 65535]], np.uint16)
     data = struct.pack('<iff', 0, 0.0, 0.0) + png(counts)
     compressed = compressed_message(factory, '16UC1; compressedDepth png', data)

@@ -1,4 +1,4 @@
-"""Pairing under everything streams do: late, lost, duplicate, out of order, time that jumps back."""
+"""Pairing with late, lost, duplicate and unordered messages, and with time that jumps back."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SECOND = 1000 * MS
 
 @dataclass(frozen=True)
 class Message:
-    """An opaque message that knows where it came from."""
+    """An opaque message that holds its stream and stamp."""
 
     stream: str
     stamp_ns: int
@@ -28,7 +28,7 @@ class Message:
 
 
 class Feed:
-    """Adds messages to a synchronizer and keeps what comes out."""
+    """Adds messages to a synchronizer and collects the sets."""
 
     def __init__(self, mode='exact', *, with_info=True, **settings):
         self.synchronizer = RgbdSynchronizer(mode, **settings)
@@ -228,7 +228,7 @@ def test_flush_gives_out_what_waits_for_better():
 
 
 def test_nobody_is_left_over_where_everybody_can_have_a_partner():
-    """Half a period apart, colour 40 fits depth 21 better than colour 0 does, but depth 58 is nearest to it."""
+    """With streams half a period apart, colour 40 fits depth 21 better than colour 0 does, but depth 58 is nearest to it."""
     assert Feed('approximate', max_interval_ns=25).add('color', 0, 40).add('depth', 21, 58).flush().pairs == [
         (0, 21),
         (40, 58),
@@ -303,7 +303,7 @@ def test_after_a_jump_the_old_messages_are_dropped():
 
 
 def test_a_stream_that_pauses_over_the_jump_pairs_again():
-    """Depth stops early in the first loop and comes back late in the second: its own stamps never jump back."""
+    """Depth stops early in the first loop and returns late in the second, so its own stamps never jump back."""
     feed = Feed().add('color', 10 * SECOND).add('depth', 10 * SECOND)
     feed.add('color', *range(11 * SECOND, 100 * SECOND, SECOND))
     feed.add('color', *range(10 * SECOND, 50 * SECOND, SECOND))
@@ -411,7 +411,7 @@ def test_pairs_do_not_depend_on_how_the_streams_interleave(color, depth, rng, in
 @settings(max_examples=200, deadline=None)
 @given(increasing, increasing, st.integers(0, 12))
 def test_no_two_neighbours_could_have_had_each_other(color, depth, interval):
-    """Of the messages left over, none is within the interval of another one left over between the same sets."""
+    """No two unpaired messages between the same sets are within the interval of each other."""
     pairs = Feed('approximate', max_interval_ns=interval, queue_size=25).add('color', *color).add('depth', *depth)
     pairs = pairs.flush().pairs
     fences = [(-1, -1), *pairs, (1000, 1000)]

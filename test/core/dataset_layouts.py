@@ -32,7 +32,7 @@ FLIP_Y_AND_Z = np.diag([1.0, -1.0, -1.0, 1.0])
 
 @dataclass(frozen=True)
 class Shot:
-    """What the camera saw: [H, W, 3] uint8, [H, W] metres, and from where (camera to world)."""
+    """A frame: colour [H, W, 3] uint8, depth [H, W] metres, and pose (camera to world)."""
 
     rgb: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
@@ -49,7 +49,7 @@ SHOTS = shoot()
 
 @dataclass(frozen=True)
 class Layout:
-    """A dataset's way to store frames.
+    """How a dataset stores frames.
 
     Attributes:
         format: the reader that must recognise it.
@@ -123,7 +123,7 @@ def nerfstudio_camera(camera: PinholeCamera) -> dict[str, float]:
 
 
 def opengl(T: NDArray[np.float64]) -> list[list[float]]:
-    """ARKit's and nerfstudio's way: the camera looks along -z, y is up."""
+    """Convert to the axes of ARKit and nerfstudio: the camera looks along -z, y is up."""
     return (T @ FLIP_Y_AND_Z).tolist()
 
 
@@ -179,7 +179,7 @@ DEPTH_CAMERA = PinholeCamera(96, 72, 80.3, 79.6, 46.1, 36.8)
 
 
 def write_scannet(folder: Path, inside: str = '.') -> Path:
-    """Colour is larger than depth, and the two cameras are calibrated on their own."""
+    """Colour is larger than depth, and each of the two cameras has its own calibration."""
     frames = folder / inside
     pairs = zip(shoot(COLOR_CAMERA), shoot(DEPTH_CAMERA), strict=True)
     for index, (color, depth) in enumerate(pairs):
@@ -195,7 +195,7 @@ def write_scannet(folder: Path, inside: str = '.') -> Path:
 
 
 def write_scannetpp(folder: Path) -> Path:
-    """The lists are in the order of the frames, the JSON file is not."""
+    """The lists have the order of the frames, the JSON file has not."""
     shots = {'train': SHOTS, 'test': SHOTS[::-1]}
     first = {'train': 7, 'test': 90}
     names = {split: [f'DSC0{first[split] + index:04d}.JPG' for index in range(3)] for split in first}
@@ -216,7 +216,7 @@ def write_scannetpp(folder: Path) -> Path:
 
 
 FOCI = [CAMERA, replace(CAMERA, fx=80.5, fy=79.5, cx=47.9), replace(CAMERA, fx=78.1, fy=77.1, cy=35.2)]
-"""A lens that focuses: the camera of each frame."""
+"""The camera of each frame: the intrinsics change because the lens focuses."""
 
 
 def focused_shots() -> list[Shot]:
@@ -281,7 +281,7 @@ def write_record3d(folder: Path) -> Path:
 
 
 def write_icl(folder: Path) -> Path:
-    """POV-Ray's world and camera are left-handed, y up: a point (x, y, z) of ours is (x, -y, z) there."""
+    """POV-Ray's world and camera are left-handed, y up: our point (x, y, z) is (x, -y, z) there."""
     mirror, lines = np.diag([1.0, -1.0, 1.0, 1.0]), []
     for number, shot in enumerate(SHOTS, 1):
         save_color(folder / f'rgb/{number}.png', shot.rgb)
@@ -308,7 +308,7 @@ def write_plain(folder: Path) -> Path:
 
 
 def write_azure(folder: Path) -> Path:
-    """Open3D's Azure Kinect export, and a log as Redwood has it."""
+    """Open3D's Azure Kinect export, with a trajectory log in Redwood's format."""
     write_images(folder, 'color/{:05d}.jpg')
     c = CAMERA
     K = [c.fx, 0, 0, 0, c.fy, 0, c.cx, c.cy, 1]
@@ -339,7 +339,7 @@ DISTORTION = (0.12, -0.2, 0.002, -0.003, 0.05)
 
 
 def write_distorted(folder: Path) -> Path:
-    """A lens that bends by some pixels: each pixel shows what a larger ideal image shows along its ray."""
+    """A lens with some pixels of distortion: each pixel is sampled from a larger ideal image along its ray."""
     c = CAMERA
     large = PinholeCamera(6 * c.width, 6 * c.height, 4 * c.fx, 4 * c.fy, 3.0 * c.width, 3.0 * c.height)
     u, v = np.meshgrid(np.arange(float(c.width)), np.arange(float(c.height)))
@@ -357,7 +357,7 @@ def write_distorted(folder: Path) -> Path:
 
 
 class InMemory:
-    """The frames as a recording, to write bags of."""
+    """The frames as a sequence, from which bags are written."""
 
     name, depth_scale = 'room', 1000.0
     camera = CAMERA
@@ -383,7 +383,7 @@ def write_rosbag2(folder: Path) -> Path:
 
 
 def write_rosbag1(folder: Path, camera: str = '/camera') -> Path:
-    """As the RealSense driver of ROS 1 names topics; written by rosbags' own ROS 1 writer."""
+    """With the topic names of the RealSense driver of ROS 1; written by rosbags' ROS 1 writer."""
     types = get_typestore(Stores.ROS1_NOETIC)
     make = lambda name, *values: types.types[name](*values)  # noqa: E731
     topics = {

@@ -1,4 +1,4 @@
-"""What every reader must do, on a tiny copy of every layout (``dataset_layouts``)."""
+"""The contract of all readers, tested on a small copy of every layout (``dataset_layouts``)."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def source(layout: Layout, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def shots(name: str):
-    """What the frames must show, in the order of the frames."""
+    """The expected frames, in order."""
     shots = shoot(LAYOUTS[name].camera)
     return shots[::-1] if name.endswith('test') else shots
 
@@ -54,7 +54,7 @@ def read(source: Path, layout: Layout, **options):
 
 
 def reprojection_errors(a, b, T_b_a):
-    """Depth errors, relative, of a frame's points seen in another; those in view of both."""
+    """Relative depth errors of a frame's points projected into another frame, for points that both frames see."""
     v, u = np.nonzero(a.depth_m)
     z = a.depth_m[v, u].astype(np.float64)
     points = np.stack([(u - a.camera.cx) / a.camera.fx * z, (v - a.camera.cy) / a.camera.fy * z, z, np.ones_like(z)])
@@ -107,7 +107,7 @@ def test_stamps_are_integer_nanoseconds_in_order(source, layout, name):
 
 
 def test_truth(source, layout, shots):
-    """Relative poses are the room's: the world is the dataset's own, the camera's axes are OpenCV's."""
+    """Relative poses equal the room's: each dataset has its own world frame, but OpenCV's camera axes."""
     sequence = read(source, layout)
     truth = sequence.ground_truth()
     assert truth.stamps_ns.tolist() == [frame.stamp_ns for frame in sequence]
@@ -119,7 +119,7 @@ def test_truth(source, layout, shots):
 
 
 def test_one_frame_reprojects_into_another(source, layout):
-    """Poses, depth and camera together; the same frames with wrong poses must not pass."""
+    """Tests poses, depth and camera together; the same frames with wrong poses must fail."""
     sequence = read(source, layout)
     truth = sequence.ground_truth().T_world_cam
     first, last = sequence[0], sequence[2]
@@ -141,7 +141,7 @@ POSES = ('transform_matrix', 'aligned_pose', 'pose', 'poses')
 
 
 def without_poses(path: Path) -> bool:
-    """Take the poses out of a JSON file; whether there were any."""
+    """Remove the poses from a JSON file. Returns True if there were any."""
 
     def stripped(values):
         if isinstance(values, list):
@@ -170,7 +170,7 @@ def test_no_truth_is_needed(source, layout):
 
 
 def test_resized_cropped_and_thinned(source, layout):
-    """The same scene point is at the pixel that the camera says, whatever was done to the images."""
+    """A scene point is at the pixel that the camera predicts, whatever was done to the images."""
     whole = read(source, layout)
     part = read(source, layout, width=layout.camera.width // 2, crop=4, start=0, stride=2)
     assert len(part) == 2
@@ -210,7 +210,7 @@ def test_wrong_folder_says_what_is_expected_and_what_is_there(tmp_path, format):
 
 
 def test_the_folder_above_or_below_says_which_was_meant(layout, tmp_path):
-    """The parent, and a folder inside: what people take by mistake."""
+    """The parent folder and a folder inside are common mistakes."""
     (tmp_path / 'downloads' / 'recording').mkdir(parents=True)
     source = layout.write(tmp_path / 'downloads' / 'recording')
     inside = [path for path in source.iterdir() if path.is_dir()] if source.is_dir() else []
@@ -273,7 +273,7 @@ def test_broken_files_are_named(tmp_path, name, file, text, message):
 
 
 def test_published_cameras():
-    """NICE-SLAM's cam_params.json of Replica, vMAP's config_replica_*.json, and ICL-NUIM's page."""
+    """From NICE-SLAM's cam_params.json of Replica, vMAP's config_replica_*.json, and ICL-NUIM's page."""
     assert replica.CAMERA.calibration.pinhole == PinholeCamera(1200, 680, 600.0, 600.0, 599.5, 339.5)
     assert (replica.CAMERA.depth_scale, replica_v2.DEPTH_SCALE, icl.DEPTH_SCALE) == (6553.5, 1000.0, 5000.0)
     assert icl.CAMERA.pinhole == PinholeCamera(640, 480, 481.2, 480.0, 319.5, 239.5)
@@ -303,7 +303,7 @@ def test_scannet_frames_without_a_pose_are_frames_without_truth(tmp_path):
 
 
 def test_scannet_depth_without_its_own_intrinsics(tmp_path):
-    """Then depth is colour's view in another size."""
+    """Depth is then colour's view at another size."""
     source = write('scannet', tmp_path)
     for path in (*source.glob('intrinsic/*_depth.txt'), *source.glob('depth/*')):
         path.unlink()
@@ -415,7 +415,7 @@ def test_unclear_plain_folder(tmp_path, change: Callable[[Path], object], messag
 
 
 def test_real_recording_as_a_plain_folder(tmp_path, recording):
-    """Links to a real recording's files, its camera and poses; the sizes and numbers of a real camera."""
+    """Links to the files of a real recording, with its camera and poses, to test with real sizes and values."""
     folder = recording('7scenes_redkitchen')
     for kind, suffix in (('rgb', 'color.jpg'), ('depth', 'depth.png'), ('poses', 'pose.txt')):
         (tmp_path / kind).mkdir()
@@ -440,7 +440,7 @@ def test_a_truncated_ros1_bag_says_so(tmp_path):
 
 
 def test_shots_are_of_some_use():
-    """The frames differ enough that a wrong pose shows, and overlap enough to be compared."""
+    """The frames differ enough to reveal a wrong pose, and overlap enough to be compared."""
     T = se3.inverse(SHOTS[0].T_world_cam) @ SHOTS[2].T_world_cam
     assert np.linalg.norm(T[:3, 3]) > 0.05
     assert np.degrees(np.linalg.norm(se3.rotation_vector(T[:3, :3]))) > 2

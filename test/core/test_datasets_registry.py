@@ -1,4 +1,4 @@
-"""Opening a recording without saying what it is, and cutting a window out of it."""
+"""Recognising the format of a recording, and cutting a window out of it."""
 
 from __future__ import annotations
 

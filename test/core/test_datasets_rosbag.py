@@ -1,4 +1,4 @@
-"""The bag writer and the bag reader: what is written comes back bit for bit, and broken bags say so."""
+"""The bag writer and the bag reader: data are read back bit for bit, and damaged bags give clear errors."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SECOND = 1_000_000_000
 
 
 class Frames:
-    """Frames in memory, of random pixels."""
+    """Frames of random pixels in memory."""
 
     name = 'frames'
 
@@ -91,7 +91,7 @@ def make_bag(path, messages, storage='sqlite3'):
 
 
 def rgbd(stamp_ns, camera='/camera'):
-    """One set, all of one stamp."""
+    """Camera info, colour and depth image with the same stamp."""
     return [
         (f'{camera}/color/camera_info', stamp_ns, info(stamp_ns)),
         (f'{camera}/color/image_raw', stamp_ns, color(stamp_ns)),
@@ -132,7 +132,7 @@ def test_synthetic_round_trip_with_truth(tmp_path, room, storage):
 
 @pytest.mark.parametrize('name', ['tum_fr1_rpy', '7scenes_redkitchen'])
 def test_real_round_trip(tmp_path, recording, name):
-    """Rectified and resized depth is still whole counts; read as a bag it is the same frame."""
+    """Rectified and resized depth still consists of whole counts, so the bag has the same frames."""
     written = open_sequence(str(recording(name)), width=80, start=3, max_frames=4)
     write_bag(written, tmp_path / 'bag')
     read = open_sequence(str(tmp_path / 'bag'))
@@ -238,7 +238,7 @@ def test_interrupted_writing_leaves_nothing(tmp_path, room, storage):
 
 
 def test_half_written_bag_is_not_at_its_place(tmp_path, room):
-    """While it is written, and so also when it is killed, there is no folder of the bag's name."""
+    """While the bag is written (and so after a kill, too) there is no folder with its name."""
     seen = []
 
     def progress(indices):
@@ -262,7 +262,7 @@ def test_unwritable_place(tmp_path, room):
 
 @pytest.mark.parametrize('storage', STORAGES)
 def test_any_order(tmp_path, storage):
-    """More frames than are looked ahead, in several chunks of 1 MB, read forwards, backwards, in jumps and twice."""
+    """More frames than the look-ahead, in several chunks of 1 MB, read forwards, backwards, in jumps and twice."""
     written = Frames([(i + 1) * 33 * MS for i in range(30)], 1000.0, size=(96, 128))
     write_bag(written, tmp_path / 'bag', storage=storage)
     read = open_sequence(str(tmp_path / 'bag'))
@@ -275,7 +275,7 @@ def test_any_order(tmp_path, storage):
 
 @pytest.mark.parametrize('storage', STORAGES)
 def test_messages_recorded_at_the_same_time(tmp_path, storage):
-    """A recorder may give many messages one time; each must still be found."""
+    """A recorder may give the same time to many messages; each must still be found."""
     stamps = [SECOND + i * 100 * MS for i in range(5)]
     messages = [('/info', SECOND, info(stamps[0]))]
     for i, stamp in enumerate(stamps):
@@ -286,7 +286,7 @@ def test_messages_recorded_at_the_same_time(tmp_path, storage):
 
 @pytest.mark.parametrize('storage', STORAGES)
 def test_iterations_over_messages_do_not_disturb_each_other(tmp_path, storage):
-    """Two at the same time, with jumps between chunks of 1 MB; and the files are kept open for the next iteration."""
+    """Two iterations at the same time, with jumps between chunks of 1 MB."""
     write_bag(Frames([(i + 1) * 33 * MS for i in range(30)], 1000.0, size=(96, 128)), tmp_path / 'bag', storage=storage)
     with Recording(tmp_path / 'bag') as recording:
         expected = [message.data for message in recording.messages(['/rgb/image'])]
@@ -313,7 +313,7 @@ def test_what_a_recording_says_about_its_topics(tmp_path):
 
 
 def test_pairs_by_header_stamp_not_by_order(tmp_path):
-    """Depth comes late and with stamps of its own; the frame has the colour's stamp."""
+    """Depth arrives late and has its own stamps; the frame has the colour image's stamp."""
     messages = [('/info', 0, info(0))]
     for i in range(4):
         stamp = SECOND + i * 33 * MS
@@ -338,7 +338,7 @@ def test_unpaired_colour_is_warned_about(tmp_path, caplog):
 
 
 def test_info_may_come_last(tmp_path):
-    """A latched info may be anywhere; offline it is known beforehand."""
+    """A latched info may be anywhere in the bag; the reader knows it beforehand."""
     messages = [message for i in range(1, 60) for message in rgbd(i * SECOND)[1:]]
     read = open_sequence(str(make_bag(tmp_path / 'bag', [*messages, rgbd(60 * SECOND)[0]])))
     assert len(read) == 59
@@ -501,7 +501,7 @@ def test_empty_bag(tmp_path, storage):
 @pytest.mark.parametrize('kept', [0.0, 0.001, 0.3, 0.7, 0.98])
 @pytest.mark.parametrize('as_file', [False, True])
 def test_truncated_bag(tmp_path, storage, kept, as_file):
-    """Cut anywhere, opened by folder or by file: one error that says so, never fewer frames."""
+    """A bag cut anywhere, opened as folder or as file, gives one error, and never fewer frames."""
     write_bag(Frames([(i + 1) * 33 * MS for i in range(12)], 1000.0), tmp_path / 'bag', storage=storage)
     (file,) = [path for path in (tmp_path / 'bag').iterdir() if path.suffix in ('.db3', '.mcap')]
     data = file.read_bytes()

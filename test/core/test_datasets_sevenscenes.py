@@ -1,4 +1,4 @@
-"""The 7-Scenes reader, on folders made here and on the real recording."""
+"""The 7-Scenes reader, on generated folders and on the real recording."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ K_TEXT = '50 0 31.5\n0 51 23.5\n0 0 1\n'
 
 
 def write_scene(folder: Path, numbers: list[int], *, suffix: str = 'png', K: str | None = K_TEXT) -> Path:
-    """64x48 frames: green is the number, depth 1234 mm but for a corner with 65535 and one with 0."""
+    """Write 64x48 frames: green is the frame number, depth 1234 mm except 65535 in one corner and 0 in another."""
     folder.mkdir(exist_ok=True)
     for number in numbers:
         stem = f'{folder}/frame-{number:06d}'

@@ -1,4 +1,4 @@
-"""The synthetic room: repeatable, exact, and as noisy as it says."""
+"""The synthetic room: repeatable, exact, and with the documented noise."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def warped(frame_a, frame_b, T_a, T_b):
 
 @pytest.mark.parametrize('seed', [0, 1])
 def test_frames_agree_under_their_true_poses(room, seed):
-    """Poses, intrinsics, pixel convention, depth and colour: one check that all say the same."""
+    """Poses, intrinsics, pixel convention, depth and colour agree with each other."""
     sequence = room(frames=16, width=WIDTH, noise=False, seed=seed)
     truth = sequence.ground_truth().T_world_cam
     a, b = sequence[0], sequence[15]
@@ -57,7 +57,7 @@ def test_frames_agree_under_their_true_poses(room, seed):
 
 
 def test_depth_at_known_walls(room):
-    """Looked at head on from a known place, a wall is as far away as it is."""
+    """A wall seen head on from a known position has the right distance."""
     sequence = room()
     eye = np.array([0.5, 0.0, 2.2])  # above the furniture
     camera = PinholeCamera(33, 25, 60.0, 60.0, 16.0, 12.0)
@@ -68,7 +68,7 @@ def test_depth_at_known_walls(room):
 
 
 def test_every_ray_meets_something_wherever_the_camera_is(room):
-    """Close to furniture surfaces reach behind the camera; none may be lost there, or the room has holes."""
+    """Close to furniture, surfaces reach behind the camera. None may be lost there, or the room would have holes."""
     sequence, rng = room(), np.random.default_rng(0)
     camera = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
     for _ in range(40):
@@ -116,7 +116,7 @@ def test_walk_is_smooth_stays_inside_and_comes_back():
 
 @pytest.mark.slow
 def test_fast_walk_needs_prediction_and_shows_new_ground():
-    """Out of reach of the paper's tracking steps from the last pose, well within it from a constant velocity."""
+    """The motion is beyond the paper's tracking steps from the last pose, but well within them from a predicted pose."""
     config = load_config('splatam').tracking
     reach = 2 * config.iterations * config.paper.rotation_rate  # radians: Adam moves each half-angle by its rate a step
     walks = [SyntheticSequence(frames=240, width=32, motion=motion, seed=seed) for motion in MOTIONS for seed in (0, 1, 2)]
@@ -143,7 +143,7 @@ def test_width_renders_the_resized_camera(room, width):
 
 
 def test_small_frame_is_the_large_one_resized(room):
-    """The same directions, whatever the size: half a pixel of shift would show."""
+    """Pixels see the same directions at every size; a shift of half a pixel would fail."""
     small, large = room(frames=1, width=160, noise=False)[0], room(frames=1, width=320, noise=False)[0]
     averaged = cv2.resize(large.rgb, (160, 120), interpolation=cv2.INTER_AREA)
     difference = np.abs(averaged.astype(float) - small.rgb)
@@ -186,7 +186,7 @@ def test_noise_off_is_exact_and_complete(room):
 
 
 def test_picture_has_detail_to_hold(room):
-    """At every scale: the paint must not be flat, nor be all in the smallest scale."""
+    """Textures have detail at every scale: they are neither flat nor only fine-grained."""
     gray = cv2.cvtColor(room(frames=1, width=320)[0].rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     for size in (1, 2, 4, 8):
         scaled = cv2.resize(gray, None, fx=1 / size, fy=1 / size, interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""The TUM RGB-D reader, on folders made here and on the real recording."""
+"""The TUM RGB-D reader, on generated folders and on the real recording."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BASE = 1305031000
 
 
 def write_tum(folder: Path, rgb_s: list[float], depth_s: list[float], *, camera: str | None = CAMERA_YAML) -> Path:
-    """A folder of 64x48 images: colour image i is all (10 i, 20, 30), depth image j is all 5000 + 50 j counts."""
+    """Write 64x48 images: all pixels of colour image i are (10 i, 20, 30), those of depth image j are 5000 + 50 j counts."""
     for name in ('rgb', 'depth'):
         (folder / name).mkdir(parents=True)
     lists = {'rgb': ['# color images', '# timestamp filename'], 'depth': ['# depth maps', '']}

@@ -1,4 +1,4 @@
-"""True poses in place of tracking, tracking at a lower resolution, and more steps where depth stays off."""
+"""Ground-truth poses instead of tracking, tracking at a lower resolution, and more steps while the depth error is large."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ QUICK = ['threads=1', 'mapping.iterations=3', 'mapping.every=1']
 
 
 class Recording:
-    """The room's frames with some other truth."""
+    """The room's frames with another ground truth."""
 
     def __init__(self, truth: Trajectory | None) -> None:
         self._room = open_sequence('synthetic', width=WIDTH, max_frames=4)
@@ -44,7 +44,7 @@ class Recording:
 
 
 def test_true_poses_are_taken_as_they_are(tmp_path: Path) -> None:
-    """Also across a fast walk that no tracker was asked to follow."""
+    """Also for a fast walk, since no tracker has to follow it."""
     source = 'synthetic:motion=fast'
     settings = [word for setting in ['tracking.method=truth', *QUICK] for word in ('--set', setting)]
     arguments = ['run', source, '--width', str(WIDTH), '--max-frames', '4', '--preset', 'quick', '--no-evaluate', *settings]
@@ -56,7 +56,7 @@ def test_true_poses_are_taken_as_they_are(tmp_path: Path) -> None:
 
 
 def test_frames_between_true_poses_get_the_pose_between(room) -> None:
-    """Half way in time is half way along the motion; beyond the truth's end there is none."""
+    """Half way in time is half way along the motion; beyond the end of the ground truth there is no pose."""
     sequence = room(frames=3, width=WIDTH)
     stamps = sequence.ground_truth().stamps_ns
     ends = np.stack([np.eye(4), se3.exp(np.array([0.2, 0, 0, 0, 0.4, 0]))])

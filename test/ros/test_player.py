@@ -1,4 +1,4 @@
-"""The player as a process of its own, over DDS, against subscribers of the test's."""
+"""The player as a separate process, over DDS, with subscribers in the test."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def subscribe(graph: Graph) -> dict[str, list[bytes]]:
 
 
 def finish(graph: Graph, player: Process) -> None:
-    """Spin until the player has ended well, and what it sent last has been taken."""
+    """Spin until the player has ended successfully and its last messages have been received."""
     graph.spin_until(lambda: not player.is_running, explain=lambda: player.text)
     assert player.wait() == 0, player.text
     graph.spin_for(0.2)  # it waited for the transport's acknowledgement; taking is all that is left
@@ -63,7 +63,7 @@ def pose(stamp: int) -> PoseStamped:
 
 
 class Answering:
-    """A node that answers colour images when told to, as splatam_node does when it has processed them."""
+    """A node that answers colour images on request, as splatam_node does when it has processed them."""
 
     def __init__(self, graph: Graph, topic: str = '/splatam/pose') -> None:
         self.received = subscribe(graph)
@@ -140,7 +140,7 @@ def test_loop_starts_over_until_stopped(graph: Graph, bag: Path) -> None:
 
 
 def make_mixed_bag(path: Path) -> None:
-    """A latched text at the start, a type nobody has installed, and IMU messages; no image."""
+    """A latched text at the start, a type that is not installed, and IMU messages; no image."""
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register(get_types_from_msg('int32 value', UNHEARD))
     zero = QosTime(0, 0)
@@ -228,7 +228,7 @@ def test_colour_without_depth_is_no_frame_to_wait_for(graph: Graph, bag: Path, t
     player = graph.play(str(copy), '--rate', 'max', '--wait-for', '--max-ahead', '2')
 
     def answer_depths() -> bool:
-        """As a node does that answers what it could pair, and nothing else."""
+        """Like a node that answers only the frames it could pair."""
         for data in received[DEPTH]:
             publisher.publish(pose(stamp_ns(data)))
         return not player.is_running
@@ -304,7 +304,7 @@ def test_space_pauses_and_goes_on(graph: Graph, bag: Path) -> None:
 
 
 def complaint(player: Process, timeout_s: float = TIMEOUT_S) -> str:
-    """The one line of a player that could not even start."""
+    """Returns the error line of a player that could not start."""
     assert player.wait(timeout_s) == 2, player.text
     errors = [line for line in player.lines if 'error:' in line]
     assert len(errors) == 1 and 'Traceback' not in player.text, player.text
@@ -312,7 +312,7 @@ def complaint(player: Process, timeout_s: float = TIMEOUT_S) -> str:
 
 
 def assert_complaints(players: Sequence[Process], expected: Sequence[str]) -> None:
-    """Players that were started together, since starting takes longest: each says what is expected."""
+    """Check the errors of players that were started together, because starting takes longest."""
     for player, message in zip(players, expected, strict=True):
         assert message in complaint(player, len(players) * TIMEOUT_S)
 

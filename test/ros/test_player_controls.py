@@ -1,4 +1,4 @@
-"""Steering the player while it plays: services, the rate's parameter, and keys."""
+"""Controls of the player during playback: services, the parameter ``rate``, and keys."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Remote:
 
 
 def stays(graph: Graph, count: Callable[[], int]) -> bool:
-    """Whether nothing more comes for the time of seven frames, once what was on its way has come."""
+    """Returns True if nothing more arrives for the time of seven frames, after messages in transit have arrived."""
     before = graph.settled(count)
     graph.spin_for(7 / 30)
     return count() == before
@@ -106,7 +106,7 @@ def test_the_rate_is_a_parameter(graph: Graph, bag: Path) -> None:
 
 @pytest.fixture
 def terminal() -> Iterator[tuple[int, int]]:
-    """The user's end and the player's."""
+    """The user's and the player's end of a pseudo terminal."""
     ends = pty.openpty()
     yield ends
     for end in ends:

@@ -1,4 +1,4 @@
-"""What docs/player.md claims."""
+"""Checks the statements of docs/player.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The standard player's switches, one by one, on the player as a process of its own."""
+"""The switches of the standard player, one by one, with the player as a separate process."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def test_topics_are_chosen_by_pattern(graph: Graph, tmp_path: Path, arguments: l
 
 
 def test_static_transforms_are_latched_whatever_was_recorded(graph: Graph, tmp_path: Path) -> None:
-    """Recorders that know no QoS record none, yet listeners ask for the transforms of before."""
+    """Recorders without QoS record none, but listeners expect earlier transforms."""
     write_texts(tmp_path / 'texts', {'/tf_static': [], '/text': []}, count=40)
     player = graph.play(str(tmp_path / 'texts'), '--start-offset', '1', '--rate', '0.01')
     transforms = graph.collect(String, '/tf_static', QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL))
@@ -360,7 +360,7 @@ def test_the_node_gets_every_frame_of_a_camera_however_fast_they_are_read(graph:
 
 
 def write_ros1(bag: Path, path: Path) -> None:
-    """The same recording as ROS 1 would have written it, and a type that ROS 2 calls otherwise."""
+    """The same recording as ROS 1 would have written it, plus a type that is not installed."""
     ros1, ros2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_JAZZY)
     writer = rosbag1.Writer(path)
     writer.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
@@ -390,7 +390,7 @@ def test_a_ros1_bag_plays_like_the_rosbag2_it_could_have_been(graph: Graph, bag:
 
 
 def test_ros1_messages_with_other_fields_are_carried_over(graph: Graph, tmp_path: Path) -> None:
-    """ROS 1 types that look different: fields of the same name and type stay, others are left out."""
+    """ROS 1 types with other fields: fields of the same name and type are kept, others are omitted."""
     ros1 = get_typestore(Stores.EMPTY)
     ros1.register(get_types_from_msg('uint32 obsolete\nstring data', 'std_msgs/msg/String'))
     with rosbag1.Writer(tmp_path / 'old.bag') as writer:

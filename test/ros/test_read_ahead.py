@@ -1,4 +1,4 @@
-"""Reading ahead of playback."""
+"""Reading messages ahead of playback."""
 
 from __future__ import annotations
 
