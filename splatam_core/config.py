@@ -229,7 +229,7 @@ class MappingConfig:
     )  # fmt: skip
     anisotropic: bool = setting(
         False,
-        'Use Gaussians with three radii and a rotation instead of one radius. Several times slower; needs mapping.optimizer: paper.',
+        'Use Gaussians with three radii and a rotation instead of one radius. Several times slower. Needs mapping.optimizer paper.',
     )
     optimizer: str = setting(
         'paper',
@@ -366,7 +366,7 @@ def check_effect(before: SlamConfig, after: SlamConfig) -> None:
     for selector, sections in SECTION_OF_METHOD.items():
         chosen = leaf(after, selector)
         for choice, section in sections.items():
-            for name in (setting.name for setting in settings() if setting.name.startswith(section)):
+            for name in (known.name for known in settings() if known.name.startswith(section)):
                 if choice != chosen and leaf(before, name) != leaf(after, name):
                     raise ConfigError(
                         f'{name} = {leaf(after, name)}: has no effect with {selector} = {chosen}; '
