@@ -135,6 +135,12 @@ class DensificationConfig:
     depth_error_ratio: float = setting(
         50.0, 'Also add where the reading lies in front of the map by more than this many median depth errors.', minimum=0.0
     )
+    depth_noise_ratio: float = setting(
+        0.0,
+        'If not 0, replaces depth_error_ratio: also add where the reading lies in front of the map by more than this many '
+        'medians of the depth noise at its distance, which grows with the square of the depth. Increase for fewer Gaussians.',
+        minimum=0.0,
+    )
     opacity: float = setting(0.5, 'Opacity of a new Gaussian.', minimum=0.01, maximum=0.99)
     bias_correction_rounds: int = setting(
         0, 'Rounds that move new Gaussians along their rays until the rendered depth matches the readings.', minimum=0

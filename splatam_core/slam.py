@@ -29,7 +29,7 @@ class Slam(SlamLifecycle):
         predicted = se3.inverse(self._motion.predict(frame.stamp_ns))
         last = se3.inverse(self._motion.last_pose)
         view = seen.device.scaled(self.config.tracking.scale)
-        tracked = self._tracker.track(view, self.map.gaussians, predicted, last)
+        tracked = self._tracker.track(view, self.map.gaussians, predicted, last, self._motion.time_offset)
         current.clock.lap('track')
         if reason := verify(tracked, self.config.tracking):
             self._motion.stop()
@@ -37,6 +37,7 @@ class Slam(SlamLifecycle):
 
         # Depth sets the pace: colour that comes late, or twice, says little about how the camera moves.
         self._motion.observe(frame.stamp_ns, se3.inverse(tracked.T_cam_world_depth))
+        self._motion.time_offset = tracked.time_offset
         posed = PosedFrame(seen, tracked.T_cam_world, self.config.mapping)
         plan = self._mapper.schedule.plan(current.index, tracked.visible_fraction)
         self._mapper.densify(posed, plan)

@@ -114,6 +114,9 @@ static void align(const float* brightness, const float* depth, const Camera& cam
       Lanes depth_residual = (frame[3] - depth_point.z) * depth_point.inverse_z;
       sums.compared += count(depth_point.inside & (frame[3] == frame[3]));
       IntLanes seen = depth_point.inside & (absolute(depth_residual) < settings.max_depth_ratio);  // false for NaN
+      // Colour needs the depth of the reference only: a point where the frame has no reading is compared by colour
+      // alone.
+      IntLanes lit = seen | (depth_point.inside & (frame[3] != frame[3]));
       Lanes by_photometric[kUnknowns], by_depth[6];
       const Lanes tilt_x = frame[4] * camera.fx * depth_point.inverse_z,
                   tilt_y = frame[5] * camera.fy * depth_point.inverse_z;
@@ -126,13 +129,13 @@ static void align(const float* brightness, const float* depth, const Camera& cam
       by_depth[4] += depth_point.x;
       const Moved color_point = is_split ? moved(color_motion, px, py, range, known, camera) : depth_point;
       if (is_split) {
-        seen &= color_point.inside;
-        sample(layers, camera.width, color_point.u, color_point.v, seen, frame);
+        seen &= color_point.inside, lit &= color_point.inside;
+        sample(layers, camera.width, color_point.u, color_point.v, lit, frame);
       }
       sums.seen += count(seen);
-      Lanes photometric_residual = keep(seen, frame[0] - (settings.gain * intensity + settings.bias));
+      Lanes photometric_residual = keep(lit, frame[0] - (settings.gain * intensity + settings.bias));
       depth_residual = keep(seen, depth_residual * incidence_cosine);
-      tally(histogram.photometric, photometric_residual, seen);
+      tally(histogram.photometric, photometric_residual, lit);
       tally(histogram.depth, depth_residual, seen);
       sums.agreeing += count(seen & (absolute(photometric_residual) <= settings.inlier_color) &
                              (absolute(depth_residual) <= settings.inlier_depth));
@@ -143,7 +146,7 @@ static void align(const float* brightness, const float* depth, const Camera& cam
       by_photometric[7] = splat(-1.0f);
       by_photometric[8] = Lanes{};
       for (int i = 0; i < 6; ++i) by_photometric[8] += by_photometric[i] * settings.velocity[i];
-      for (int i = 0; i < kUnknowns; ++i) by_photometric[i] = keep(seen, by_photometric[i]);
+      for (int i = 0; i < kUnknowns; ++i) by_photometric[i] = keep(lit, by_photometric[i]);
       for (int i = 0; i < 6; ++i) by_depth[i] = keep(seen, by_depth[i] * depth_point.inverse_z * incidence_cosine);
 
       const float photometric_precision = 1.0f / (settings.photometric_scale * settings.photometric_scale);

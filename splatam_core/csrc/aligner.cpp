@@ -31,6 +31,25 @@ void add(AlignmentSums& total, const AlignmentSums& part) {
   total.seen += part.seen, total.agreeing += part.agreeing;
 }
 
+// See Aligner::fill_holes; one row or column of count pixels, stride floats apart.
+void fill_line(float* line, int count, std::size_t stride, int max_gap, float max_step) {
+  int before = -1;
+  for (int i = 0; i < count; ++i) {
+    const float far_side = line[i * stride];
+    if (!(far_side > 0.0f)) continue;  // NaN is none
+    const int gap = i - before - 1;
+    if (before >= 0 && gap > 0 && gap <= max_gap) {
+      const float near_side = line[before * stride];
+      if (std::fabs(far_side - near_side) <= max_step * std::min(near_side, far_side))
+        for (int k = 1; k <= gap; ++k) {
+          const float t = float(k) / float(gap + 1);
+          line[(before + k) * stride] = 1.0f / ((1.0f - t) / near_side + t / far_side);
+        }
+    }
+    before = i;
+  }
+}
+
 }  // namespace
 
 template <typename Task>
@@ -73,6 +92,15 @@ void Aligner::halve(const float* brightness, const float* depth, int width, int 
             0.25f * (brightness[a] + brightness[a + 1] + brightness[b] + brightness[b + 1]);
         half_depth[y * columns + x] = farthest - nearest <= max_step * mean ? mean : kNone;
       }
+  });
+}
+
+void Aligner::fill_holes(float* depth, int width, int height, int max_gap, float max_step) {
+  for_rows(height, [&](int, int begin, int end) {
+    for (int y = begin; y < end; ++y) fill_line(depth + std::size_t(y) * width, width, 1, max_gap, max_step);
+  });
+  for_rows(width, [&](int, int begin, int end) {
+    for (int x = begin; x < end; ++x) fill_line(depth + x, height, std::size_t(width), max_gap, max_step);
   });
 }
 

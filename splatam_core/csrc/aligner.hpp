@@ -25,6 +25,10 @@ class Aligner {
   void halve(const float* brightness, const float* depth, int width, int height, float max_step, float* half_brightness,
              float* half_depth);
 
+  // Closes holes of at most max_gap pixels, along rows and then along columns, where the depths on both sides differ by
+  // at most the fraction max_step of the nearer one. In place. Inverse depth is interpolated: exact on a plane.
+  void fill_holes(float* depth, int width, int height, int max_gap, float max_step);
+
   // Writes the layers [H, W, kLayers] of an image. Depth is NaN where it changes by more than the fraction max_step
   // from one pixel to the next.
   void layers(const float* brightness, const float* depth, int width, int height, float max_step, float* layers);

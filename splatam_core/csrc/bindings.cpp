@@ -127,6 +127,14 @@ py::tuple halve(Aligner& aligner, const Array& brightness, const Array& depth, f
   return py::make_tuple(half_brightness, half_depth);
 }
 
+Array fill_holes(Aligner& aligner, const Array& depth, int max_gap, float max_step) {
+  const int width = int(depth.shape(1)), height = int(depth.shape(0));
+  Array result({height, width});
+  std::copy(depth.data(), depth.data() + depth.size(), result.mutable_data());
+  aligner.fill_holes(result.mutable_data(), width, height, max_gap, max_step);
+  return result;
+}
+
 Array layers(Aligner& aligner, const Array& brightness, const Array& depth, float max_step) {
   const int width = int(brightness.shape(1)), height = int(brightness.shape(0));
   Array result({height, width, kLayers});
@@ -174,6 +182,7 @@ void bind_aligner(py::module_& module) {
            py::arg("bias"), py::arg("photometric_scale"), py::arg("depth_scale"), py::arg("max_depth_ratio"),
            py::arg("inlier_color"), py::arg("inlier_depth"))
       .def("halve", &halve, py::arg("brightness"), py::arg("depth"), py::arg("max_step"))
+      .def("fill_holes", &fill_holes, py::arg("depth"), py::arg("max_gap"), py::arg("max_step"))
       .def("layers", &layers, py::arg("brightness"), py::arg("depth"), py::arg("max_step"));
 }
 

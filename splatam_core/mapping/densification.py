@@ -18,6 +18,11 @@ MAX_BIAS = 0.1
 
 BIAS_WINDOW = 5  # pixels
 
+MIN_SQUARED_DEPTH = 0.01  # m^2: against division by zero
+
+MIN_NEW_DEPTH, MIN_NEW_FRACTION = 0.02, 0.01
+"""Metres, and fraction of the depth: a smaller error is never taken for something new."""
+
 
 def densify(
     gaussian_map: GaussianMap, view: View, T_cam_world: Tensor, rasterizer: Rasterizer, config: DensificationConfig
@@ -49,16 +54,26 @@ def depth_bias(render: Render, view: View) -> Tensor:
 
 
 def unexplained(render: Render, view: View, config: DensificationConfig) -> Tensor:
-    """Returns [H, W] which pixels show no map, or something new in front of it (paper, equation 9).
-
-    The median depth error is taken over the pixels that have both a reading and a rendered depth.
-    """
+    """Returns [H, W] which pixels show no map, or something new in front of it (paper, equation 9)."""
     unmapped = render.silhouette < config.silhouette_threshold
     depth = render.depth()
-    error = (depth - view.depth).abs()
-    compared = view.valid & (depth > 0)
-    in_front = (depth > view.depth) & (error > config.depth_error_ratio * median(error, compared))
+    in_front = (depth > view.depth) & ((depth - view.depth).abs() > _significant_error(depth, view, config))
     return (unmapped | in_front) & view.valid
+
+
+def _significant_error(depth: Tensor, view: View, config: DensificationConfig) -> Tensor:
+    """Returns, [H, W] or [], the depth error in metres beyond which a reading shows something new.
+
+    The paper takes a multiple of the median error. In a deep scene that is metres, and a near surface that was mapped from
+    afar stays full of holes. The noise of stereo and structured light grows with the square of the depth, so one number
+    describes it at every distance (Khoshelham and Elberink 2012); a floor covers the map's own error.
+    """
+    error, compared = (depth - view.depth).abs(), view.valid & (depth > 0)
+    if config.depth_noise_ratio == 0:
+        return config.depth_error_ratio * median(error, compared)
+    squared = view.depth.square()
+    noise = median(error / squared.clamp(min=MIN_SQUARED_DEPTH), compared)
+    return (config.depth_noise_ratio * noise * squared).clamp(min=MIN_NEW_DEPTH) + MIN_NEW_FRACTION * view.depth
 
 
 def new_gaussians(view: View, chosen: Tensor, depth: Tensor, T_cam_world: Tensor, opacity: float) -> Gaussians:

@@ -29,6 +29,7 @@ from splatam_core.retired_settings import migrated
 from splatam_core.runs.archive import Content, pack, read_archive
 from splatam_core.state import SlamState
 from splatam_core.tracking.motion import MotionState
+from splatam_core.tracking.time_offset import TimeOffset
 
 VERSION = 1
 KIND, KEYFRAME = 'checkpoint', 'keyframe'
@@ -175,7 +176,7 @@ def _to_content(state: SlamState, progress: Progress, digests: Sequence[str]) ->
         'config': flat_values(state.config), 'camera': None if state.camera is None else asdict(state.camera),
         'keyframes': list(digests), 'rng': state.rng, 'scene_radius': state.scene_radius, 'num_frames': state.num_frames,
         'last_stamp_ns': state.last_stamp_ns, 'progress': asdict(progress),
-        'motion_ns': [motion.stamp_ns, motion.interval_ns],
+        'motion_ns': [motion.stamp_ns, motion.interval_ns], 'time_offset': asdict(motion.time_offset),
     }  # fmt: skip
     arrays = {_MAP + name: array for name, array in state.map.items()}
     return Content(values, arrays | {'T_world_cam': motion.T_world_cam, 'velocity': motion.velocity})
@@ -185,12 +186,13 @@ def _from_content(path: Path, content: Content) -> Checkpoint:
     values, arrays = content.values, content.arrays
     camera = None if values['camera'] is None else PinholeCamera(**values['camera'])
     stamp_ns, interval_ns = values['motion_ns']
+    time_offset = TimeOffset(**values.get('time_offset', {}))  # 0.1.0 estimated it in every frame anew
     state = SlamState(
         config=with_values(SlamConfig(), migrated(values['config'])),
         camera=camera,
         map={name.removeprefix(_MAP): array for name, array in arrays.items() if name.startswith(_MAP)},
         keyframes=tuple(_read_keyframe(path.parent, digest, camera) for digest in values['keyframes']),
-        motion=MotionState(stamp_ns, interval_ns, arrays['T_world_cam'], arrays['velocity']),
+        motion=MotionState(stamp_ns, interval_ns, arrays['T_world_cam'], arrays['velocity'], time_offset),
         rng=values['rng'],
         scene_radius=values['scene_radius'],
         num_frames=values['num_frames'],

@@ -44,7 +44,7 @@ class LinearSystem(Protocol):
 
     @property
     def seen(self) -> int:
-        """Of these, points on the same surface as the reading."""
+        """Of these, points on the same surface as the reading. Points without a reading enter ``H`` and ``g`` by colour alone."""
 
     @property
     def agreeing(self) -> int:
@@ -70,6 +70,13 @@ class Aligner(Protocol[ImageT]):
 
         Gradients are 0 at the border. Depth is NaN where it changes by more than the fraction ``max_step`` from one pixel
         to the next.
+        """
+
+    def fill_holes(self, depth: ImageT, max_gap: int, max_step: float) -> ImageT:
+        """Returns depth [H, W] with holes of at most ``max_gap`` pixels closed, along rows and then along columns.
+
+        A hole is closed where the depths on both sides differ by at most the fraction ``max_step`` of the nearer one.
+        Inverse depth is interpolated, which is exact on a plane.
         """
 
     def halve(self, brightness: ImageT, depth: ImageT, max_step: float) -> tuple[ImageT, ImageT]:

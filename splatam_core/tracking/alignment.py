@@ -30,6 +30,7 @@ from splatam_core.tracking.base import TrackingResult
 from splatam_core.tracking.features import pose_by_features
 from splatam_core.tracking.gauss_newton import GaussNewton
 from splatam_core.tracking.pyramid import Level, frame_level, full_pyramid, half_pyramid, render_level
+from splatam_core.tracking.time_offset import TimeOffset
 from splatam_core.tracking.torch_aligner import TorchAligner
 from splatam_core.tracking.verdict import verify
 
@@ -43,12 +44,14 @@ class _Frame:
         pyramid: the frame at a half, a quarter, ... of its resolution.
         gaussians: the map.
         T_cam_world_before: [4, 4] pose one frame ago; None if not known.
+        time_offset: between colour and depth, before this frame.
     """
 
     view: View
     pyramid: list[Level]
     gaussians: Gaussians
     T_cam_world_before: Matrix | None
+    time_offset: TimeOffset
 
 
 class AlignmentTracker:
@@ -61,10 +64,16 @@ class AlignmentTracker:
         self._gauss_newton = GaussNewton(self._aligner, config)
 
     def track(
-        self, view: View, gaussians: Gaussians, T_cam_world: Matrix, T_cam_world_before: Matrix | None = None
+        self,
+        view: View,
+        gaussians: Gaussians,
+        T_cam_world: Matrix,
+        T_cam_world_before: Matrix | None = None,
+        time_offset: TimeOffset | None = None,
     ) -> TrackingResult:
         """See ``Tracker.track``."""
-        frame = _Frame(view, half_pyramid(frame_level(view), self._aligner), gaussians, T_cam_world_before)
+        pyramid = half_pyramid(frame_level(view, self._aligner), self._aligner)
+        frame = _Frame(view, pyramid, gaussians, T_cam_world_before, time_offset or TimeOffset())
         found = self._align_twice(frame, T_cam_world)
         if self._is_good(found) or not self._config.align.features:
             return found
@@ -81,7 +90,7 @@ class AlignmentTracker:
         references = self._reference_pyramid(frame, T_cam_world)
         before = frame.T_cam_world_before
         predicted_motion = None if before is None else T_cam_world @ se3.inverse(before)
-        alignment = self._gauss_newton.align(references, frame.pyramid, predicted_motion)
+        alignment = self._gauss_newton.align(references, frame.pyramid, predicted_motion, frame.time_offset)
         state, system = alignment.state, alignment.system
         num_readings = int((frame.pyramid[0].depth > 0).sum())
         return TrackingResult(
@@ -90,6 +99,7 @@ class AlignmentTracker:
             num_readings=num_readings,
             visible_fraction=system.compared / max(1, num_readings),
             inlier_fraction=system.agreeing / max(1, system.compared),
+            time_offset=alignment.time_offset,
         )
 
     def _reference_pyramid(self, frame: _Frame, T_cam_world: Matrix) -> list[Level]:

@@ -8,6 +8,7 @@ from typing import Protocol
 from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians
+from splatam_core.tracking.time_offset import TimeOffset
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,6 +21,7 @@ class TrackingResult:
         num_readings: pixels with a depth reading; None for a tracker that looks at none.
         visible_fraction: fraction of the pixels with a depth reading that see the map at the pose.
         inlier_fraction: fraction of those that agree with the map in depth and colour.
+        time_offset: between colour and depth, after this frame.
     """
 
     T_cam_world: Matrix
@@ -27,13 +29,19 @@ class TrackingResult:
     num_readings: int | None
     visible_fraction: float
     inlier_fraction: float
+    time_offset: TimeOffset = TimeOffset()
 
 
 class Tracker(Protocol):
     """A way to find the camera."""
 
     def track(
-        self, view: View, gaussians: Gaussians, T_cam_world: Matrix, T_cam_world_before: Matrix | None = None
+        self,
+        view: View,
+        gaussians: Gaussians,
+        T_cam_world: Matrix,
+        T_cam_world_before: Matrix | None = None,
+        time_offset: TimeOffset | None = None,
     ) -> TrackingResult:
         """Finds the pose from which the map looks like the view; changes nothing.
 
@@ -42,4 +50,5 @@ class Tracker(Protocol):
             gaussians: the map.
             T_cam_world: [4, 4] predicted pose.
             T_cam_world_before: [4, 4] pose one frame ago; None if not known.
+            time_offset: between colour and depth, as the frames before tell; None if they tell nothing.
         """

@@ -15,6 +15,7 @@ from splatam_core.geometry import se3
 from splatam_core.geometry.se3 import Matrix
 from splatam_core.tracking.aligner import Aligner, Array, LinearSystem
 from splatam_core.tracking.pyramid import EDGE, Level
+from splatam_core.tracking.time_offset import TimeOffset
 
 _MIN_POINTS = 50
 _SMALL_STEP = 1e-5  # m, rad: converged
@@ -23,7 +24,7 @@ _MIN_SCALES = 0.004, 0.001  # no sensor is better
 _MAD_TO_DEVIATION = 1.4826  # standard deviation over median absolute deviation, for a normal distribution
 _LEAST_WEIGHT = 1e-6
 _TWIST, _GAIN_AND_BIAS, _TIME_OFFSET = range(6), range(6, 8), range(8, 9)  # the unknowns
-_PRIOR = np.array([0.3] * 6 + [0.1] * 2 + [0.5]) ** -2  # variance^-1 of a step: m and rad; gain, bias; frame intervals
+_PRIOR = np.array([0.3] * 6 + [0.1] * 2) ** -2  # variance^-1 of a step: m and rad; gain, bias
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,16 +62,35 @@ class AlignmentState:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """What is aligned at one level.
+
+    Attributes:
+        reference: the render.
+        layers: of the frame, see ``Aligner.layers``.
+        predicted_motion: [4, 4] from the camera one frame ago to the render's; None if that is not known.
+        time_offset: between colour and depth, before this frame.
+    """
+
+    reference: Level
+    layers: Array | Tensor
+    predicted_motion: Matrix | None
+    time_offset: TimeOffset
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
     """A state, and how well the frame agrees with the reference there.
 
     Attributes:
         state: the state.
         system: the residuals at the finest level.
+        time_offset: between colour and depth, after this frame.
     """
 
     state: AlignmentState
     system: LinearSystem
+    time_offset: TimeOffset
 
 
 class GaussNewton:
@@ -86,39 +106,48 @@ class GaussNewton:
         align = config.align
         exposure, time_offset = _GAIN_AND_BIAS if align.exposure else (), _TIME_OFFSET if align.time_offset else ()
         self._free = [*_TWIST, *exposure, *time_offset]  # the unknowns to solve for
+        self._estimates_time_offset = align.time_offset
 
-    def align(self, references: Sequence[Level], frames: Sequence[Level], predicted_motion: Matrix | None) -> Alignment:
+    def align(
+        self, references: Sequence[Level], frames: Sequence[Level], predicted_motion: Matrix | None, time_offset: TimeOffset
+    ) -> Alignment:
         """Aligns from coarse to fine, starting where the reference was rendered.
 
         Args:
             references: pyramid of the render, finest level first.
             frames: pyramid of the frame, with the same cameras.
             predicted_motion: [4, 4] from the camera one frame ago to the render's; None if that is not known.
+            time_offset: between colour and depth, before this frame.
 
         Returns:
             The state found, or the start where that explains the finest level better.
         """
         start = state = AlignmentState(np.eye(4))
+        if self._estimates_time_offset and predicted_motion is not None:
+            state = replace(state, time_offset=time_offset.mean)
         scales = _FIRST_SCALES
         for reference, frame in zip(reversed(references), reversed(frames), strict=True):
             layers = self._aligner.layers(frame.brightness, frame.depth, EDGE)
-            state, scales = self._iterate(reference, layers, state, scales, predicted_motion)
+            state, scales = self._iterate(_Pair(reference, layers, predicted_motion, time_offset), state, scales)
+        system = self._linearize(references[0], layers, state, scales)
+        after = time_offset
+        if self._estimates_time_offset:
+            after = time_offset.updated(state.time_offset, self._time_offset_information(system))
         return self._better(
-            Alignment(start, self._linearize(references[0], layers, start, scales)),
-            Alignment(state, self._linearize(references[0], layers, state, scales)),
+            Alignment(start, self._linearize(references[0], layers, start, scales), time_offset),
+            Alignment(state, system, after),
         )
 
     def _iterate(
-        self, reference: Level, layers: Array | Tensor, state: AlignmentState, scales: tuple[float, float],
-        predicted_motion: Matrix | None,
-    ) -> tuple[AlignmentState, tuple[float, float]]:  # fmt: skip
+        self, pair: _Pair, state: AlignmentState, scales: tuple[float, float]
+    ) -> tuple[AlignmentState, tuple[float, float]]:
         """Takes steps at one level until they are small. Returns the state and the scales of the residuals."""
         for _ in range(self._config.iterations):
-            if predicted_motion is not None:
-                state = replace(state, velocity=se3.log(state.depth_motion @ predicted_motion))
-            system = self._linearize(reference, layers, state, scales)
+            if pair.predicted_motion is not None:
+                state = replace(state, velocity=se3.log(state.depth_motion @ pair.predicted_motion))
+            system = self._linearize(pair.reference, pair.layers, state, scales)
             scales = _scales(system)
-            step = _step(system, state, self._free)
+            step = _step(system, state, self._free, pair.time_offset)
             if step is None:
                 break
             state = state.moved(step)
@@ -151,6 +180,12 @@ class GaussNewton:
             inlier_depth=config.inlier_depth,
         )
 
+    def _time_offset_information(self, system: LinearSystem) -> float:
+        """Returns the inverse variance that the residuals claim for the time offset, the other unknowns marginalized."""
+        others = [unknown for unknown in self._free if unknown not in _TIME_OFFSET]
+        (t,), H = _TIME_OFFSET, system.H + np.diag(np.append(_PRIOR, 0.0))
+        return float(system.H[t, t] - H[t, others] @ np.linalg.solve(H[np.ix_(others, others)], H[others, t]))
+
     def _better(self, start: Alignment, found: Alignment) -> Alignment:
         """Returns the alignment of lower cost. A point that is not seen costs as much as the average one at the start."""
         unseen_cost = start.system.cost / max(1, start.system.seen)
@@ -168,15 +203,16 @@ def _scales(system: LinearSystem) -> tuple[float, float]:
     )
 
 
-def _step(system: LinearSystem, state: AlignmentState, free: list[int]) -> Matrix | None:
+def _step(system: LinearSystem, state: AlignmentState, free: list[int], time_offset: TimeOffset) -> Matrix | None:
     """Returns the step [9] of the free unknowns that minimises the residuals; None if they do not determine one.
 
     On a ramp of brightness a shift looks like a change of bias. The priors decide what the residuals leave open.
     """
     if system.seen < _MIN_POINTS:
         return None
-    H, g = system.H + np.diag(_PRIOR), system.g.copy()
-    g[6:] += _PRIOR[6:] * (state.gain - 1, state.bias, state.time_offset)
+    prior = np.append(_PRIOR, time_offset.information)
+    H, g = system.H + np.diag(prior), system.g.copy()
+    g[6:] += prior[6:] * (state.gain - 1, state.bias, state.time_offset - time_offset.mean)
     step = np.zeros(len(g))
     try:
         step[free] = -np.linalg.solve(H[np.ix_(free, free)], g[free])

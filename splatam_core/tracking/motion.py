@@ -9,6 +9,7 @@ import numpy as np
 
 from splatam_core.geometry import se3
 from splatam_core.geometry.se3 import Matrix
+from splatam_core.tracking.time_offset import TimeOffset
 
 MotionPrior = Callable[[int, int], 'Matrix | None']
 """Pose [4, 4] of the camera at the second stamp (ns) in the camera at the first, by another sensor; None = not known."""
@@ -26,16 +27,21 @@ class MotionState:
         interval_ns: over which the velocity was observed.
         T_world_cam: [4, 4] the last pose.
         velocity: [6] twist per second, in the camera's frame.
+        time_offset: between colour and depth.
     """
 
     stamp_ns: int
     interval_ns: int
     T_world_cam: Matrix
     velocity: Matrix
+    time_offset: TimeOffset = TimeOffset()
 
 
 class MotionModel:
     """Predicts by another sensor if there is one, else extrapolates the last velocity, by stamps: frames may be missing.
+
+    Attributes:
+        time_offset: between colour and depth, a property of the camera: it outlives a lost track.
 
     Args:
         constant_velocity: whether to extrapolate the velocity; else the prediction is the last pose.
@@ -49,6 +55,7 @@ class MotionModel:
         self._interval_ns = 0
         self._T_world_cam: Matrix = np.eye(4)
         self._velocity = np.zeros(6)  # twist per second, in the camera's frame
+        self.time_offset = TimeOffset()
 
     @property
     def last_pose(self) -> Matrix:
@@ -57,7 +64,7 @@ class MotionModel:
 
     def state(self) -> MotionState:
         """Returns the state, for ``restore``."""
-        return MotionState(self._stamp_ns, self._interval_ns, self._T_world_cam, self._velocity)
+        return MotionState(self._stamp_ns, self._interval_ns, self._T_world_cam, self._velocity, self.time_offset)
 
     def restore(self, state: MotionState) -> None:
         """Sets the state to that of another motion model.
@@ -69,7 +76,7 @@ class MotionModel:
             shapes = f'pose {state.T_world_cam.shape} and velocity {state.velocity.shape}'
             raise ValueError(f'{shapes}: expected (4, 4) and (6,)')
         self._stamp_ns, self._interval_ns = state.stamp_ns, state.interval_ns
-        self._T_world_cam, self._velocity = state.T_world_cam, state.velocity
+        self._T_world_cam, self._velocity, self.time_offset = state.T_world_cam, state.velocity, state.time_offset
 
     def predict(self, stamp_ns: int) -> Matrix:
         """Returns the predicted pose [4, 4], camera to world, at a stamp."""

@@ -9,6 +9,7 @@ from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians, Rasterizer
 from splatam_core.tracking.base import TrackingResult
+from splatam_core.tracking.time_offset import TimeOffset
 
 
 class NullTracker:
@@ -21,7 +22,12 @@ class NullTracker:
         pass
 
     def track(
-        self, view: View, gaussians: Gaussians, T_cam_world: Matrix, T_cam_world_before: Matrix | None = None
+        self,
+        view: View,
+        gaussians: Gaussians,
+        T_cam_world: Matrix,
+        T_cam_world_before: Matrix | None = None,
+        time_offset: TimeOffset | None = None,
     ) -> TrackingResult:
         """See ``Tracker.track``."""
         return TrackingResult(T_cam_world, T_cam_world, num_readings=None, visible_fraction=1.0, inlier_fraction=1.0)

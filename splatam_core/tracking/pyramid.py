@@ -20,6 +20,7 @@ from splatam_core.tracking.aligner import Aligner, Array
 EDGE = 0.05
 """Depth that changes by more than this fraction from one pixel to the next is an edge, not a surface."""
 
+_MAX_HOLE = 0.025  # of the width: wider holes of the depth stay open
 _COARSEST_PX = 32  # smaller images show too little to align
 _DEPTH_LAYER = 3
 
@@ -39,12 +40,19 @@ class Level:
     depth: Array | Tensor
 
 
-def frame_level(view: View) -> Level:
-    """Returns a frame at its full resolution."""
+def frame_level(view: View, aligner: Aligner[Any]) -> Level:
+    """Returns a frame at its full resolution, with small holes of its depth closed.
+
+    Half of a stereo camera's readings may be missing, and depth that was registered by forward warping has a grid of holes.
+    Halving drops every block with a hole, and colour is compared only at points of known depth.
+    """
+    max_gap = max(1, round(_MAX_HOLE * view.camera.width))
     if not is_on_host(view.depth):
-        return Level(view.camera, brightness(view.rgb8), torch.where(view.valid, view.depth, torch.nan))
+        readings = torch.where(view.valid, view.depth, torch.nan)
+        return Level(view.camera, brightness(view.rgb8), aligner.fill_holes(readings, max_gap, EDGE))
     depth = np.where(view.valid, view.depth, np.float32(np.nan))
-    return Level(view.camera, _brightness(view.rgb8.numpy().astype(np.float32) / np.float32(255)), depth)
+    light = _brightness(view.rgb8.numpy().astype(np.float32) / np.float32(255))
+    return Level(view.camera, light, aligner.fill_holes(depth, max_gap, EDGE))
 
 
 def render_level(render: Render, camera: PinholeCamera, silhouette_threshold: float) -> Level:

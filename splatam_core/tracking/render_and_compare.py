@@ -16,6 +16,7 @@ from splatam_core.rasterizer import Gaussians, Rasterizer
 from splatam_core.tracking.base import TrackingResult
 from splatam_core.tracking.candidate import Candidate
 from splatam_core.tracking.loss import TrackingLoss, tracking_loss
+from splatam_core.tracking.time_offset import TimeOffset
 from splatam_core.tracking.verdict import compare
 
 
@@ -27,7 +28,12 @@ class RenderAndCompareTracker:
         self._config = config
 
     def track(
-        self, view: View, gaussians: Gaussians, T_cam_world: Matrix, T_cam_world_before: Matrix | None = None
+        self,
+        view: View,
+        gaussians: Gaussians,
+        T_cam_world: Matrix,
+        T_cam_world_before: Matrix | None = None,
+        time_offset: TimeOffset | None = None,
     ) -> TrackingResult:
         """See ``Tracker.track``."""
         config, gaussians = self._config, gaussians.detached()

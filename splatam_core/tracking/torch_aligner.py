@@ -51,6 +51,11 @@ class TorchAligner:
         result[..., 3] = torch.where(is_surface, depth, torch.nan)
         return result
 
+    def fill_holes(self, depth: Tensor, max_gap: int, max_step: float) -> Tensor:
+        """See ``Aligner.fill_holes``."""
+        along_rows = _filled_rows(depth, max_gap, max_step)
+        return _filled_rows(along_rows.T, max_gap, max_step).T.contiguous()
+
     def halve(self, brightness: Tensor, depth: Tensor, max_step: float) -> tuple[Tensor, Tensor]:
         """See ``Aligner.halve``."""
         z = _blocks(depth)
@@ -86,15 +91,18 @@ class TorchAligner:
         residuals = torch.stack([value[0] - (gain * intensity + bias), (value[1] - moved.z[1]) * moved.inverse_z[1]])
         compared = moved.inside[1] & ~value[1].isnan()
         seen = moved.inside.all(dim=0) & (residuals[1].abs() < max_depth_ratio)  # False for NaN
+        unread = moved.inside[1] & value[1].isnan()  # colour needs the depth of the reference only
+        used = torch.stack([(seen | unread) & moved.inside[0], seen])  # [2, P]
         tilt = torch.stack([along_u[1] * camera.fx, along_v[1] * camera.fy]) * moved.inverse_z[1]  # [2, P]
         # Turns the depth difference along the ray into a distance from the surface.
         incidence_cosine = 1 / (1 + (tilt * tilt).sum(dim=0)).sqrt()
-        residuals = torch.where(seen, torch.stack([residuals[0], residuals[1] * incidence_cosine]), 0)
+        residuals = torch.where(used, torch.stack([residuals[0], residuals[1] * incidence_cosine]), 0)
         agree = seen & (residuals[0].abs() <= inlier_color) & (residuals[1].abs() <= inlier_depth)
         image_gradients = torch.stack([along_u * camera.fx, along_v * camera.fy])  # [2, 2, P]
         jacobian = _jacobian(moved, image_gradients, incidence_cosine, intensity, speed)
         counts = torch.stack([known, compared, seen, agree]).sum(dim=1)
-        return _summed(torch.where(seen, jacobian, 0), residuals, scales, counts, _medians(residuals, seen))
+        system = torch.where(used, jacobian, 0), residuals
+        return _summed(system, scales, counts, _medians(residuals, used), seen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,6 +125,18 @@ class _Moved:
         u, v = camera.fx * x * inverse_z + camera.cx, camera.fy * y * inverse_z + camera.cy
         inside = known & (z > 0) & (u >= 0) & (v >= 0) & (u < camera.width - 1) & (v < camera.height - 1)
         return cls(x=x, y=y, z=z, inverse_z=inverse_z, u=u, v=v, inside=inside)
+
+
+def _filled_rows(depth: Tensor, max_gap: int, max_step: float) -> Tensor:
+    width = depth.shape[1]
+    columns, known = torch.arange(width, device=depth.device), depth > 0
+    before = torch.where(known, columns, -1).cummax(dim=1).values
+    after = width - 1 - torch.where(known, width - 1 - columns, -1).flip(1).cummax(dim=1).values.flip(1)
+    near_side, far_side = depth.gather(1, before.clamp(min=0)), depth.gather(1, after.clamp(max=width - 1))
+    is_small = (before >= 0) & (after < width) & (after - before <= max_gap + 1)
+    is_surface = (far_side - near_side).abs() <= max_step * torch.minimum(near_side, far_side)
+    t = (columns - before) / (after - before).clamp(min=1)
+    return torch.where(~known & is_small & is_surface, 1 / ((1 - t) / near_side + t / far_side), depth)
 
 
 def _blocks(image: Tensor) -> Tensor:
@@ -164,23 +184,23 @@ def _jacobian(moved: _Moved, image_gradients: Tensor, incidence_cosine: Tensor, 
     return torch.cat([by_twist, torch.stack([others, torch.zeros_like(others)], dim=1)])
 
 
-def _medians(residuals: Tensor, seen: Tensor) -> Tensor:
-    """Returns [2] upper edges of the bins that hold the medians of the absolute residuals; NaN if no point is seen."""
+def _medians(residuals: Tensor, used: Tensor) -> Tensor:
+    """Returns [2] upper edges of the bins that hold the medians of the absolute residuals that are used; NaN if none is."""
     bins = ((residuals.abs().view(torch.int32) >> _BIN_BITS) - _FIRST_BIN).clamp_(0, _BINS - 1).long()
     histogram = torch.zeros(2, _BINS, dtype=torch.int64, device=bins.device)
-    counted = histogram.scatter_add_(1, bins, seen.long().expand(2, -1)).cumsum(dim=1)
+    counted = histogram.scatter_add_(1, bins, used.long()).cumsum(dim=1)
     median = (2 * counted < counted[:, -1:]).sum(dim=1)
     edges = ((median + 1 + _FIRST_BIN) << _BIN_BITS).int().view(torch.float32)
     return torch.where(counted[:, -1] > 0, edges, torch.nan)
 
 
-def _summed(jacobian: Tensor, residuals: Tensor, scales: Tensor, counts: Tensor, medians: Tensor) -> TorchLinearSystem:
+def _summed(system: tuple[Tensor, Tensor], scales: Tensor, counts: Tensor, medians: Tensor, is_seen: Tensor) -> TorchLinearSystem:
     """Returns the sums, brought to the host in one transfer. Weights: Student's t with five degrees of freedom."""
-    precisions = 1 / (scales * scales)
+    (jacobian, residuals), precisions = system, 1 / (scales * scales)
     squared = residuals * residuals * precisions
     weighted = (jacobian * (6 / (5 + squared) * precisions)).flatten(1)
     H, g = weighted @ jacobian.flatten(1).T, weighted @ residuals.flatten()
-    cost = (squared / (5 + squared)).sum()
+    cost = torch.where(is_seen, squared / (5 + squared), 0).sum()
     sums = torch.cat([H.flatten(), g, cost[None], medians, counts.float()]).numpy(force=True).astype(np.float64)
     matrix, vector, (total, *middles), tallies = np.split(sums, np.cumsum([_UNKNOWNS**2, _UNKNOWNS, 3]))
     points, compared, seen, agreeing = map(int, tallies)

@@ -70,6 +70,41 @@ def test_layers_and_halving_are_the_native_ones(size: tuple[int, int]) -> None:
             assert np.allclose(half.numpy(), expected_half, rtol=1e-6, equal_nan=True)
 
 
+@pytest.mark.parametrize('threads', [1, 3])
+def test_holes_are_closed_between_readings_of_one_surface(threads: int) -> None:
+    """Exactly on a tilted plane; not across a step, a wide hole or the border; by either aligner."""
+    v, u = np.mgrid[:24, :40].astype(np.float32)
+    plane = 1 / (0.4 + 0.004 * u + 0.002 * v)
+    plane[:, 25:] *= 1.3  # a step
+    depth = plane.copy()
+    depth[5, 3:6] = depth[8:10, 10] = depth[12, 24:27] = depth[15, 5:17] = depth[20, :2] = np.nan
+    depth[14:17, 4:18] = np.nan  # wider than four pixels, but only three high
+    native = make_native_aligner(threads).fill_holes(depth, 4, EDGE)
+    assert np.allclose(TorchAligner().fill_holes(torch.from_numpy(depth), 4, EDGE).numpy(), native, rtol=1e-6, equal_nan=True)
+    closed = ~np.isnan(native)
+    assert np.allclose(native[closed], plane[closed], rtol=1e-5)
+    assert closed[5, 3:6].all() and closed[8:10, 10].all() and closed[14:17, 4:18].all()
+    assert closed[12, 24:27].all(), 'the column bridges what the row must not'
+    assert np.isnan(make_native_aligner(threads).fill_holes(depth[12:13], 4, EDGE)[0, 24:27]).all()
+    assert np.isnan(make_native_aligner(threads).fill_holes(depth[20:21], 4, EDGE)[0, :2]).all()
+
+
+def test_colour_is_compared_where_the_frame_has_no_depth() -> None:
+    """Half of the frame without readings: all of its colour counts for the pose, and none of it for the agreement."""
+    size = (48, 64)
+    reference = _picture(4, size)[0], np.full(size, 2.0, np.float32)
+    frame_depth = reference[1].copy()
+    frame_depth[:, 32:] = np.nan
+    native = make_native_aligner(1)
+    settings = _settings(np.eye(4), np.eye(4)) | {'camera': _camera(size)}
+    half, full = (
+        native.linearize(*reference, native.layers(reference[0], depth, EDGE), **settings) for depth in (frame_depth, reference[1])
+    )
+    assert half.compared < 0.55 * full.compared and half.seen == half.compared
+    assert half.H[7, 7] == pytest.approx(full.H[7, 7], rel=0.02)  # bias: the weights of colour alone; the border differs
+    assert half.H[2, 2] < 0.6 * full.H[2, 2]  # along the axis depth says most, and half of it is missing
+
+
 @pytest.mark.parametrize('time_offset', [0.0, 0.3])
 @pytest.mark.parametrize('size', [(48, 65), (120, 160)])
 @pytest.mark.parametrize('isa', ['generic', 'avx2', 'avx512'])
@@ -151,6 +186,9 @@ class _Bridge:
 
     def layers(self, brightness: Image, depth: Image, max_step: float) -> Image:
         return self._aligner.layers(*_tensors(brightness, depth), max_step).numpy()
+
+    def fill_holes(self, depth: Image, max_gap: int, max_step: float) -> Image:
+        return self._aligner.fill_holes(*_tensors(depth), max_gap, max_step).numpy()
 
     def halve(self, brightness: Image, depth: Image, max_step: float) -> tuple[Image, ...]:
         return tuple(image.numpy() for image in self._aligner.halve(*_tensors(brightness, depth), max_step))
