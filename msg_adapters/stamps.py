@@ -12,8 +12,21 @@ NANOSECONDS = 1_000_000_000
 
 
 def to_ns(stamp: Any) -> int:
-    """Convert a ``builtin_interfaces/Time`` to nanoseconds."""
-    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+    """Convert a ``builtin_interfaces/Time`` to nanoseconds.
+
+    Raises:
+        MessageError: seconds or nanoseconds are out of range.
+    """
+    return _checked_ns(int(stamp.sec), int(stamp.nanosec))
+
+
+def _checked_ns(sec: int, nanosec: int) -> int:
+    if not (-(2**31) <= sec < 2**31 and 0 <= nanosec < NANOSECONDS):
+        raise MessageError(
+            f'stamp with sec {sec} and nanosec {nanosec}: sec must fit 32 bits, nanosec be from 0 to {NANOSECONDS - 1}; '
+            'the driver stamps wrongly'
+        )
+    return sec * NANOSECONDS + nanosec
 
 
 def from_ns(stamp_ns: int) -> tuple[int, int]:
@@ -29,7 +42,11 @@ def from_ns(stamp_ns: int) -> tuple[int, int]:
 
 
 def message_stamp_ns(message: Any) -> int:
-    """Returns the stamp of a message's header in nanoseconds."""
+    """Returns the stamp of a message's header in nanoseconds.
+
+    Raises:
+        MessageError: seconds or nanoseconds are out of range.
+    """
     return to_ns(message.header.stamp)
 
 
@@ -40,13 +57,13 @@ def serialized_stamp_ns(data: bytes) -> int:
         data: CDR bytes of a message whose first field is a ``std_msgs/Header`` or a ``builtin_interfaces/Time``.
 
     Raises:
-        MessageError: there are too few bytes.
+        MessageError: there are too few bytes, or the stamp is out of range.
     """
     if len(data) < 12:
         raise MessageError(f'has {len(data)} bytes, too few for a header')
     byte_order = '<' if data[1] & 1 else '>'  # second of the four bytes of the CDR encapsulation
     seconds, nanoseconds = struct.unpack_from(f'{byte_order}iI', data, 4)
-    return seconds * NANOSECONDS + nanoseconds
+    return _checked_ns(seconds, nanoseconds)
 
 
 def header(factory: MessageFactory, stamp_ns: int, frame_id: str) -> Any:

@@ -20,6 +20,9 @@ from splatam_core.resources import config_dir
 from splatam_core.retired_settings import migrated, tombstone
 from splatam_core.settings import Setting, Value, flatten, leaf, setting, settings_of, unflatten, with_leaf
 
+MAX_STEPS, MAX_SAMPLES, MAX_FRAMES = 100_000, 1_000_000, 10**9
+MAX_PX = 65_536
+MAX_SEED = 2**63 - 1
 DEVICES = ('auto', 'cpu', 'cuda')
 WHERE = frozenset({'device', 'rasterizer', 'keyframes.on_device'})
 """Settings that say where SLAM is computed, and do not change its result by more than rounding."""
@@ -77,7 +80,11 @@ class AlignmentConfig:
         minimum=0.0, maximum=1.0,
     )  # fmt: skip
     half_render_from: int = setting(
-        0, 'Render the map at half size for frames at least this wide; 0 = never. Decrease to save time.', unit='px', minimum=0
+        0,
+        'Render the map at half size for frames at least this wide; 0 = never. Decrease to save time.',
+        unit='px',
+        minimum=0,
+        maximum=MAX_PX,
     )
 
 
@@ -93,7 +100,7 @@ class TrackingConfig:
     )
     iterations: int = setting(
         40, 'Optimization steps per frame; with align, at most this many per resolution. Increase when the camera moves fast.',
-        minimum=0,
+        minimum=0, maximum=MAX_STEPS,
     )  # fmt: skip
     scale: float = setting(1.0, 'Size at which frames are tracked, relative to the frame.', minimum=0.05, maximum=1.0)
     color_weight: float = setting(0.5, 'Weight of the colour error.', minimum=0.0)
@@ -121,7 +128,9 @@ class TrackingConfig:
 class DensificationConfig:
     """Where a frame adds Gaussians (paper, section 3.3)."""
 
-    every: int = setting(1, 'Add Gaussians on every n-th mapped frame. Increase to save time.', unit='frames', minimum=1)
+    every: int = setting(
+        1, 'Add Gaussians on every n-th mapped frame. Increase to save time.', unit='frames', minimum=1, maximum=MAX_FRAMES
+    )
     min_visible_fraction: float = setting(
         0.0, 'Add on the frames between as well, when the map is visible at less than this fraction of the readings.',
         minimum=0.0, maximum=1.0,
@@ -130,7 +139,7 @@ class DensificationConfig:
         1.0, 'Size at which Gaussians are added, relative to the frame. Decrease for fewer, larger Gaussians.',
         minimum=0.05, maximum=1.0,
     )  # fmt: skip
-    max_width: int = setting(0, 'Largest width at which Gaussians are added; 0 = no limit.', unit='px', minimum=0)
+    max_width: int = setting(0, 'Largest width at which Gaussians are added; 0 = no limit.', unit='px', minimum=0, maximum=MAX_PX)
     silhouette_threshold: float = setting(0.5, 'Add where the rendered silhouette is below this.', minimum=0.0, maximum=1.0)
     depth_error_ratio: float = setting(
         50.0, 'Also add where the reading lies in front of the map by more than this many median depth errors.', minimum=0.0
@@ -143,7 +152,10 @@ class DensificationConfig:
     )
     opacity: float = setting(0.5, 'Opacity of a new Gaussian.', minimum=0.01, maximum=0.99)
     bias_correction_rounds: int = setting(
-        0, 'Rounds that move new Gaussians along their rays until the rendered depth matches the readings.', minimum=0
+        0,
+        'Rounds that move new Gaussians along their rays until the rendered depth matches the readings.',
+        minimum=0,
+        maximum=MAX_STEPS,
     )
 
 
@@ -151,14 +163,16 @@ class DensificationConfig:
 class KeyframeConfig:
     """Which frames are kept, and which of them are mapped together (paper, section 3.4)."""
 
-    every: int = setting(5, 'Keep every n-th frame. Decrease when the camera moves fast.', unit='frames', minimum=1)
+    every: int = setting(
+        5, 'Keep every n-th frame. Decrease when the camera moves fast.', unit='frames', minimum=1, maximum=MAX_FRAMES
+    )
     at_least: int = setting(
         0, 'Keep frames more often when a recording would give fewer keyframes than this; 0 = off. Live length is unknown.',
-        minimum=0,
+        minimum=0, maximum=MAX_FRAMES,
     )  # fmt: skip
     window: int = setting(
         24, 'Frames that are mapped together, the current one included. Increase when earlier views get worse.',
-        unit='frames', minimum=1,
+        unit='frames', minimum=1, maximum=MAX_FRAMES,
     )  # fmt: skip
     selection: str = setting(
         'overlap',
@@ -173,18 +187,24 @@ class KeyframeConfig:
         minimum=0.0, maximum=1.0,
     )  # fmt: skip
     overlap_samples: int = setting(
-        1600, 'Pixels sampled to measure the overlap with a keyframe. Decrease to save time.', unit='px', minimum=1
+        1600,
+        'Pixels sampled to measure the overlap with a keyframe. Decrease to save time.',
+        unit='px',
+        minimum=1,
+        maximum=MAX_SAMPLES,
     )
-    overlap_margin: int = setting(20, 'Border of a keyframe inside which a sample does not overlap.', unit='px', minimum=0)
+    overlap_margin: int = setting(
+        20, 'Border of a keyframe inside which a sample does not overlap.', unit='px', minimum=0, maximum=MAX_PX
+    )
     budget: int = setting(
         0,
         'Largest number of keyframes; beyond it, the one whose neighbours in time are nearest to each other is dropped. '
         '0 = no limit; set it for runs of hours.',
-        unit='frames', minimum=0,
+        unit='frames', minimum=0, maximum=MAX_FRAMES,
     )  # fmt: skip
     on_device: int = setting(
         100, 'On a GPU, largest number of keyframes in its memory, at 20 bytes a pixel. Increase when it has memory to spare.',
-        unit='frames', minimum=1,
+        unit='frames', minimum=1, maximum=MAX_FRAMES,
     )  # fmt: skip
 
 
@@ -196,8 +216,10 @@ class PaperMappingConfig:
     depth_outlier_ratio: float = setting(
         0.0, 'Ignore readings whose depth error exceeds this many median errors; 0 = use all.', minimum=0.0
     )
-    prune_every: int = setting(20, 'Prune at steps 0, n, 2n, ... of a frame; 0 = never.', unit='steps', minimum=0)
-    prune_until: int = setting(20, 'Last step of a frame that may prune.', unit='steps', minimum=0)
+    prune_every: int = setting(
+        20, 'Prune at steps 0, n, 2n, ... of a frame; 0 = never.', unit='steps', minimum=0, maximum=MAX_STEPS
+    )
+    prune_until: int = setting(20, 'Last step of a frame that may prune.', unit='steps', minimum=0, maximum=MAX_STEPS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +227,10 @@ class FusedMappingConfig:
     """Settings of the fused optimizer (``mapping.optimizer: fused``)."""
 
     final_passes: int = setting(
-        0, 'Passes over all keyframes after the last frame, with decreasing step sizes. Increase for a better final map.', minimum=0
+        0,
+        'Passes over all keyframes after the last frame, with decreasing step sizes. Increase for a better final map.',
+        minimum=0,
+        maximum=MAX_STEPS,
     )
     prune_fraction: float = setting(
         0.0,
@@ -219,19 +244,23 @@ class MappingConfig:
     """Map refinement and pruning (paper, section 3.4)."""
 
     enabled: bool = setting(True, 'Add to the map and refine it. Off: only track the camera in a map that was loaded.')
-    every: int = setting(1, 'Map every n-th frame. Increase to save time.', unit='frames', minimum=1)
+    every: int = setting(1, 'Map every n-th frame. Increase to save time.', unit='frames', minimum=1, maximum=MAX_FRAMES)
     hold_out: int = setting(
-        0, 'Track every n-th frame, but keep it out of the map, to score the map on it; 0 = none.', unit='frames', minimum=0
+        0,
+        'Track every n-th frame, but keep it out of the map, to score the map on it; 0 = none.',
+        unit='frames',
+        minimum=0,
+        maximum=MAX_FRAMES,
     )
-    iterations: int = setting(60, 'Optimization steps per mapped frame. Increase for a sharper map.', minimum=0)
-    first_iterations: int = setting(0, 'Additional steps on the first frame.', minimum=0)
+    iterations: int = setting(60, 'Optimization steps per mapped frame. Increase for a sharper map.', minimum=0, maximum=MAX_STEPS)
+    first_iterations: int = setting(0, 'Additional steps on the first frame.', minimum=0, maximum=MAX_STEPS)
     scale: float = setting(
         1.0, 'Size at which views are fitted and kept as keyframes, relative to the frame.', minimum=0.1, maximum=1.0
     )
-    max_width: int = setting(0, 'Largest width at which views are fitted; 0 = no limit.', unit='px', minimum=0)
+    max_width: int = setting(0, 'Largest width at which views are fitted; 0 = no limit.', unit='px', minimum=0, maximum=MAX_PX)
     half_size_every: int = setting(
         0, 'Fit the view at half its size in every n-th step of a frame, for a quarter of the work; 0 = never.',
-        unit='steps', minimum=0,
+        unit='steps', minimum=0, maximum=MAX_STEPS,
     )  # fmt: skip
     anisotropic: bool = setting(
         False,
@@ -270,9 +299,13 @@ class MappingConfig:
 class SlamConfig:
     """Every setting of SLAM. The defaults are the paper's for Replica."""
 
-    seed: int = setting(0, 'Seed of every random choice.', minimum=0)
+    seed: int = setting(0, 'Seed of every random choice.', minimum=0, maximum=MAX_SEED)
     width: int = setting(
-        0, "Width to which 'splatam run' shrinks wider frames; --width takes precedence; 0 = as recorded.", unit='px', minimum=0
+        0,
+        "Width to which 'splatam run' shrinks wider frames; --width takes precedence; 0 = as recorded.",
+        unit='px',
+        minimum=0,
+        maximum=MAX_PX,
     )
     threads: int = setting(0, 'CPU threads; 0 = all cores, 1 = results repeat bit for bit.', minimum=0, maximum=256)
     device: str = setting(

@@ -131,13 +131,25 @@ class SlamLifecycle:
             T_world_cam: [4, 4] approximate pose of the camera in it.
 
         Raises:
-            ConfigError: the map is anisotropic and the configuration is not.
+            ConfigError: as ``check_map``; nothing has changed.
         """
+        self.check_map(gaussians)
+        mapper = self._new_mapper()
+        mapper.map.append(gaussians)
+        self.reset()
+        self._mapper = mapper
+        self._motion.place(T_world_cam)
+
+    def check_map(self, gaussians: Gaussians) -> None:
+        """Checks that a map made earlier can be loaded.
+
+        Raises:
+            ConfigError: the map is empty, or it is anisotropic and the configuration is not.
+        """
+        if len(gaussians) == 0:
+            raise ConfigError('the map has no Gaussians, so no camera can be found in it')
         if gaussians.rotations is not None and not self.config.mapping.anisotropic:
             raise ConfigError('the map has anisotropic Gaussians: set mapping.anisotropic=true')
-        self.reset()
-        self.map.append(gaussians)
-        self._motion.place(T_world_cam)
 
     def state(self) -> SlamState:
         """Returns everything that later frames depend on; ``restore`` continues from it bit for bit."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar, get_type_hints
@@ -42,16 +44,17 @@ class Setting:
         Raises:
             ConfigError: the value has the wrong type or is outside what is allowed.
         """
-        if self.type is float and isinstance(value, int) and not isinstance(value, bool):
+        if self.type is float and type(value) is int and abs(value) <= sys.float_info.max:
             value = float(value)
         if not isinstance(value, Value) or type(value) is not self.type or (self.choices and value not in self.choices):
-            raise ConfigError(f'{self.name} = {value!r}: expected {self._allowed()}')
+            raise ConfigError(f'{self.name} = {shown(value)}: expected {self._allowed()}')
         if not isinstance(value, str) and not self._contains(value):
-            raise ConfigError(f'{self.name} = {value}: expected {self._allowed()}')
+            raise ConfigError(f'{self.name} = {shown(value)}: expected {self._allowed()}')
         return value
 
     def _contains(self, number: float) -> bool:
-        """False for NaN, too, where there is a bound."""
+        if isinstance(number, float) and not math.isfinite(number):
+            return False
         is_high_enough = self.minimum is None or number >= self.minimum
         return is_high_enough and (self.maximum is None or number <= self.maximum)
 
@@ -62,6 +65,15 @@ class Setting:
         bounds = [f'at least {self.minimum:g}'] if self.minimum is not None else []
         bounds += [f'at most {self.maximum:g}'] if self.maximum is not None else []
         return ' '.join([kind, ' and '.join(bounds), f'({self.unit})' if self.unit else '']).strip()
+
+
+def shown(value: object) -> str:
+    """Returns a value as it is written in one line, without the middle of a very long one."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python writes no number of more than 4300 digits
+        return 'a number of thousands of digits'
+    return text if len(text) <= 200 else f'{text[:100]}...{text[-20:]}'
 
 
 def setting(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from splatam_core.errors import FrameError
 from splatam_core.types import FrameResult, RgbdFrame
 
 if TYPE_CHECKING:
@@ -16,6 +16,12 @@ if TYPE_CHECKING:
 
 T = TypeVar('T')
 WhenFull = Literal['drop_oldest', 'block']
+POLL_S = 0.1  # longest time until ``give_up`` is asked again
+
+
+def never() -> bool:
+    """Never gives up."""
+    return False
 
 
 class WorkerStopped(RuntimeError):
@@ -28,15 +34,16 @@ class SlamWorker:
     Frames wait in a bounded queue and are processed in the order of submission. When the queue is full,
     use ``drop_oldest`` for a live camera and ``block`` for a recording.
 
-    An exception other than FrameError stops the worker: waiting frames are dropped, ``submit`` raises
-    WorkerStopped, and ``stop`` raises the exception.
+    An exception costs the frame that caused it: it is reported, and the next frame is processed. Only what is no
+    ``Exception``, such as SystemExit, stops the worker: waiting frames are dropped, ``submit`` raises WorkerStopped,
+    and ``stop`` raises the exception.
     """
 
     def __init__(
         self,
         slam: Slam,
         on_result: Callable[[RgbdFrame, FrameResult], None],
-        on_bad_frame: Callable[[RgbdFrame, FrameError], None],
+        on_bad_frame: Callable[[RgbdFrame, Exception], None],
         *,
         queue_size: int,
         when_full: WhenFull,
@@ -47,7 +54,8 @@ class SlamWorker:
         Args:
             slam: the caller must not use it before ``stop`` has returned.
             on_result: called on the worker's thread after each frame; may use the Slam.
-            on_bad_frame: called on the worker's thread with each frame that Slam refused.
+            on_bad_frame: called on the worker's thread with each frame that Slam refused, with its FrameError, or for which
+                Slam or a callback failed, with any other exception.
             queue_size: largest number of waiting frames, in addition to the one being processed.
             when_full: what ``submit`` does when the queue is full.
             before_frame: called on the worker's thread before each frame; may change the Slam.
@@ -70,13 +78,13 @@ class SlamWorker:
         self._busy = False
         self._dropped = 0
         self._stopping = False
-        self._error: Exception | None = None
+        self._error: BaseException | None = None
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name='slam')
         self._thread.start()
 
     @property
-    def error(self) -> Exception | None:
+    def error(self) -> BaseException | None:
         """Exception that stopped the worker; None if there was none."""
         with self._changed:
             return self._error
@@ -93,15 +101,23 @@ class SlamWorker:
         with self._changed:
             return len(self._frames) + self._busy
 
-    def submit(self, frame: RgbdFrame) -> None:
+    def submit(self, frame: RgbdFrame, give_up: Callable[[], bool] = never) -> bool:
         """Queue a frame. If the queue is full, drop the oldest frame or wait, as configured.
+
+        Args:
+            frame: the frame.
+            give_up: asked while waiting; once it returns True the frame is dropped.
+
+        Returns:
+            True if the frame is queued.
 
         Raises:
             WorkerStopped: the worker is stopping or has stopped.
         """
         with self._changed:
-            if self._when_full == 'block':
-                self._changed.wait_for(lambda: self._stopping or len(self._frames) < self._queue_size)
+            while self._when_full == 'block' and not self._changed.wait_for(self._accepts_or_stops, POLL_S):
+                if give_up():
+                    return False
             if self._stopping:
                 raise WorkerStopped('the SLAM worker has stopped and accepts no frames') from self._error
             if len(self._frames) == self._queue_size:
@@ -109,6 +125,7 @@ class SlamWorker:
                 self._dropped += 1
             self._frames.append(frame)
             self._changed.notify_all()
+        return True
 
     def call(self, function: Callable[[Slam], T]) -> Future[T]:
         """Run a function on the worker's thread, before the next waiting frame.
@@ -124,30 +141,57 @@ class SlamWorker:
                 self._changed.notify_all()
         return future
 
-    def stop(self, drain: bool) -> None:
+    def stop(self, drain: bool, give_up: Callable[[], bool] = never) -> int:
         """End the thread and wait for it.
 
         Args:
             drain: True to process the waiting frames first, False to drop them.
+            give_up: asked while frames and calls wait; once it returns True they are dropped and cancelled.
+
+        Returns:
+            Number of waiting frames that were dropped.
 
         Raises:
-            Exception: the exception that stopped the worker, if there was one.
+            BaseException: the exception that stopped the worker, if there was one.
         """
         with self._changed:
             self._stopping = True
-            if not drain:
-                self._frames.clear()
+            num_dropped = 0 if drain else self._drop_waiting()
             self._changed.notify_all()
+            while not self._changed.wait_for(self._is_idle, POLL_S):
+                if give_up():
+                    num_dropped += self._drop_waiting()
+                    break
+            futures = self._take_futures()
+        for future in futures:
+            future.cancel()
         self._thread.join()
         if self._error is not None:
             raise self._error
+        return num_dropped
+
+    def _accepts_or_stops(self) -> bool:
+        return self._stopping or len(self._frames) < self._queue_size
+
+    def _is_idle(self) -> bool:
+        return not (self._frames or self._tasks or self._busy)
+
+    def _drop_waiting(self) -> int:
+        num_dropped = len(self._frames)
+        self._frames.clear()
+        return num_dropped
+
+    def _take_futures(self) -> list[Future[Any]]:
+        futures = [future for future, _ in self._tasks]
+        self._tasks.clear()
+        return futures
 
     def _run(self) -> None:
         try:
             while (job := self._next()) is not None:
                 job()
                 self._done()
-        except Exception as error:  # noqa: BLE001 - stop() raises it
+        except BaseException as error:  # noqa: BLE001 - stop() raises it
             self._fail(error)
 
     def _next(self) -> Callable[[], None] | None:
@@ -165,14 +209,20 @@ class SlamWorker:
             return lambda: self._process(frame)
 
     def _process(self, frame: RgbdFrame) -> None:
-        if self._before_frame is not None:
-            self._before_frame(self._slam, frame)
         try:
-            result = self._slam.process(frame)
-        except FrameError as error:
+            if self._before_frame is not None:
+                self._before_frame(self._slam, frame)
+            self._on_result(frame, self._slam.process(frame))
+        except Exception as error:  # noqa: BLE001 - whatever it is, the next frame may be fine
+            self._report_bad_frame(frame, error)
+
+    def _report_bad_frame(self, frame: RgbdFrame, error: Exception) -> None:
+        try:
             self._on_bad_frame(frame, error)
-        else:
-            self._on_result(frame, result)
+        except Exception as another:  # noqa: BLE001 - likewise
+            logging.getLogger(__name__).error(
+                'frame %d ns failed (%r), and so did the report about it: %r', frame.stamp_ns, error, another
+            )
 
     def _fulfil(self, future: Future[T], function: Callable[[Slam], T]) -> None:
         if not future.set_running_or_notify_cancel():
@@ -187,14 +237,13 @@ class SlamWorker:
             self._busy = False
             self._changed.notify_all()
 
-    def _fail(self, error: Exception) -> None:
+    def _fail(self, error: BaseException) -> None:
         with self._changed:
             self._error = error
             self._stopping = True
             self._busy = False
-            self._frames.clear()
-            futures = [future for future, _ in self._tasks]
-            self._tasks.clear()
+            self._drop_waiting()
+            futures = self._take_futures()
             self._changed.notify_all()
         for future in futures:
             future.cancel()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType, TracebackType
@@ -33,12 +34,18 @@ class StopRequest:
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
+        self._since_s = 0.0
         self._previous: dict[signal.Signals, object] = {}
 
     @property
     def requested(self) -> bool:
         """True if a signal has arrived."""
         return self.signal is not None
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time since the first signal; 0 before it."""
+        return time.monotonic() - self._since_s if self.requested else 0.0
 
     def __enter__(self) -> StopRequest:
         self._previous = {number: signal.signal(number, self._request) for number in self.SIGNALS}
@@ -49,7 +56,9 @@ class StopRequest:
             signal.signal(number, handler)  # type: ignore[arg-type]
 
     def _request(self, number: int, frame: FrameType | None) -> None:
-        self.signal = self.signal or signal.Signals(number)
+        if self.signal is None:
+            self._since_s = time.monotonic()
+            self.signal = signal.Signals(number)
 
 
 def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:

@@ -15,6 +15,7 @@ from rclpy.subscription import Subscription
 
 from msg_adapters import stamps
 from splatam_ros.process import RosError
+from splatam_ros.throttled_warnings import ThrottledWarnings
 
 DEPTH = 10
 QOS_OVERRIDES = 'qos_overrides.'
@@ -71,6 +72,7 @@ class MonitoredSubscription:
         self._node = node
         self._message_class = message_class
         self._on_message = on_message
+        self._warnings = ThrottledWarnings(node.get_logger())
         overridden = _check_overrides(node, node.resolve_topic_name(topic))
         self._may_fall_back = reliability == 'auto' and QoSPolicyKind.RELIABILITY not in overridden
         self._qos = QoSProfile(
@@ -117,8 +119,11 @@ class MonitoredSubscription:
 
     def _receive(self, message: Any) -> None:
         self.received += 1
-        self.delay_s = (self._node.get_clock().now().nanoseconds - stamps.message_stamp_ns(message)) / 1e9
-        self._on_message(message)
+        try:
+            self.delay_s = (self._node.get_clock().now().nanoseconds - stamps.message_stamp_ns(message)) / 1e9
+            self._on_message(message)
+        except Exception as error:  # noqa: BLE001 - whatever a message holds, the next one may be fine
+            self._warnings.warn_of('message', f'{self.topic}: a message is skipped', error)
         self.last_received_s = time.monotonic()  # afterwards, because handling a message may wait for SLAM
 
     def _on_incompatible(self, event: QoSRequestedIncompatibleQoSInfo) -> None:

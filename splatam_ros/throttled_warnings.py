@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import time
+import traceback
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
+
+from msg_adapters.errors import MessageError
+from splatam_core.errors import SplatamError, one_line
 
 
 class ThrottledWarnings:
@@ -31,3 +35,22 @@ class ThrottledWarnings:
         self._logged_s[kind] = now_s
         suppressed = self._num_suppressed.pop(kind, 0)
         self._logger.warning(text + (f' (and {suppressed} more of this kind before)' if suppressed else ''))
+
+    def warn_of(self, kind: str, what: str, error: Exception) -> None:
+        """Log a warning about an error. One that the user cannot cause also logs its traceback, at level debug.
+
+        Args:
+            kind: kind of the warning.
+            what: what it cost, e.g. ``frame skipped``.
+            error: the error.
+        """
+        if isinstance(error, (SplatamError, MessageError)):
+            self.warn(kind, f'{what}: {error}')
+            return
+        self.warn(kind, f'{what}: {describe(error)}; the traceback is logged at level debug')
+        self._logger.debug(''.join(traceback.format_exception(error)))
+
+
+def describe(error: Exception) -> str:
+    """Returns one line about an error that nobody expected."""
+    return f'unexpected {type(error).__name__}: {one_line(error)}'

@@ -20,6 +20,8 @@ Matrix = NDArray[np.float64]
 KEEP_NS = 60 * 10**9  # how much of a moving frame's past is kept
 MAX_GAP_NS = 500_000_000  # longest gap that is interpolated; 2 Hz is slow for odometry
 JUMP_NS = 10**9  # messages overtake each other by less; a larger step back means that the clock was set back
+MAX_POSES = 60_000  # of one frame: a minute at 1 kHz
+MAX_FRAMES = 1000  # far more than robots have; some publish a new name for each thing they see
 MAX_DEPTH = 100  # frames from leaf to root; more means a loop
 
 
@@ -42,6 +44,8 @@ class History:
         self._poses[at : at + is_known] = [(stamp_ns, T_parent_child)]
         if self._poses[0][0] < stamp_ns - 2 * KEEP_NS:  # rarely, because it copies the remaining poses
             del self._poses[: self._index(stamp_ns - KEEP_NS)]
+        if len(self._poses) > 2 * MAX_POSES:
+            del self._poses[:-MAX_POSES]
 
     def at(self, stamp_ns: int) -> Matrix:
         """Returns the [4, 4] pose at a stamp. It is interpolated, never extrapolated.
@@ -71,7 +75,10 @@ class History:
 
 
 class TransformBuffer:
-    """A tree of frames. Each frame has one parent, and is static or moving in it. Thread-safe."""
+    """A tree of frames. Each frame has one parent, and is static or moving in it. Thread-safe.
+
+    It holds at most ``MAX_FRAMES`` static frames, the first ones, and as many moving ones, those received last.
+    """
 
     def __init__(self) -> None:
         self._static: dict[str, tuple[str, Matrix]] = {}
@@ -79,17 +86,26 @@ class TransformBuffer:
         self._changed = threading.Condition()
 
     def set_static(self, parent: str, child: str, T_parent_child: Matrix) -> None:
-        """Set a transform that holds at all times."""
+        """Set a transform that holds at all times.
+
+        Raises:
+            TransformError: there are too many frames.
+        """
         with self._changed:
+            if child not in self._static and len(self._static) >= MAX_FRAMES:
+                raise TransformError(f'{MAX_FRAMES} static frames are known already')
             self._static[child] = parent, T_parent_child
             self._changed.notify_all()
 
     def add(self, parent: str, child: str, stamp_ns: int, T_parent_child: Matrix) -> None:
         """Add the pose of a moving frame at a stamp."""
         with self._changed:
-            link = self._moving.get(child)
+            link = self._moving.pop(child, None)
             if link is None or link[0] != parent:
-                link = self._moving[child] = parent, History()
+                link = parent, History()
+            self._moving[child] = link  # the last in order
+            if len(self._moving) > MAX_FRAMES:
+                del self._moving[next(iter(self._moving))]
             link[1].add(stamp_ns, T_parent_child)
             self._changed.notify_all()
 

@@ -14,12 +14,16 @@ from numpy.typing import NDArray
 
 from splatam_core.errors import ConfigError
 from splatam_core.geometry import se3
+from splatam_core.settings import shown
 from splatam_ros.frames.buffer import TransformBuffer, TransformError
 from splatam_ros.frames.options import FrameOptions
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 Matrix = NDArray[np.float64]
 Link = tuple[str, str]  # parent and child
+
+MAX_METRES = 1e6
+SHORTEST_QUATERNION = 1e-6  # squares of shorter ones lose their digits
 
 # Optical axes (x right, y down, z forward) in body axes (x forward, y left, z up); REP 103.
 T_BODY_OPTICAL: Matrix = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -129,6 +133,12 @@ class CoordinateFrames:
     def moving(self, located: Located) -> dict[Link, Matrix]:
         """Returns the transforms to publish on ``/tf``: ``T_parent_child`` by (parent, child)."""
         map_frame, odom_frame = self._options.map_frame, self._options.odom_frame
+        if located.body_frame in ('', map_frame, odom_frame):
+            self._warnings.warn(
+                'body', f"nothing is published on /tf: the camera's frame is '{located.body_frame}', which must have a name, and "
+                f"another one than '{map_frame}' and '{odom_frame}'; set the images' frame id in the driver, or camera_frame",
+            )  # fmt: skip
+            return {}
         if self._options.has_odometry:
             return {} if located.T_map_odom is None else {(map_frame, odom_frame): located.T_map_odom}
         if (parent := self._buffer.static_parent(located.body_frame)) is not None:
@@ -193,9 +203,9 @@ def parse_pose(name: str, text: str) -> Matrix:
         values = np.array([float(word) for word in text.replace(',', ' ').split()])
     except ValueError:
         values = np.empty(0)
-    is_pose = len(values) in (6, 7) and np.isfinite(values).all()
-    if not is_pose or (len(values) == 7 and not values[3:].any()):
-        raise ConfigError(f"{name} = '{text}': expected 'x y z qx qy qz qw' or 'x y z roll pitch yaw', in metres and radians")
+    is_pose = len(values) in (6, 7) and (np.abs(values) <= MAX_METRES).all()  # False for NaN
+    if not is_pose or (len(values) == 7 and not np.linalg.norm(values[3:]) >= SHORTEST_QUATERNION):
+        raise ConfigError(f"{name} = {shown(text)}: expected 'x y z qx qy qz qw' or 'x y z roll pitch yaw', in metres and radians")
     if len(values) == 7:
         return se3.compose(values[[6, 3, 4, 5]], values[:3])
     T = np.eye(4)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -84,21 +84,26 @@ class TfTopics:
 
     def _receive_static(self, message: Any) -> None:
         for transform in message.transforms:
-            if (T := self._matrix(transform)) is not None:
-                self._buffer.set_static(_name(transform.header.frame_id), _name(transform.child_frame_id), T)
+            self._attempt(self._set_static, transform)
 
     def _receive_moving(self, message: Any) -> None:
         for transform in message.transforms:
-            if (T := self._matrix(transform)) is not None:
-                parent, child = _name(transform.header.frame_id), _name(transform.child_frame_id)
-                self._buffer.add(parent, child, stamps.message_stamp_ns(transform), T)
+            self._attempt(self._add, transform)
 
-    def _matrix(self, transform: Any) -> Matrix | None:
+    def _set_static(self, transform: Any) -> None:
+        parent, child = _name(transform.header.frame_id), _name(transform.child_frame_id)
+        self._buffer.set_static(parent, child, poses.transform_matrix(transform.transform))
+
+    def _add(self, transform: Any) -> None:
+        parent, child = _name(transform.header.frame_id), _name(transform.child_frame_id)
+        self._buffer.add(parent, child, stamps.message_stamp_ns(transform), poses.transform_matrix(transform.transform))
+
+    def _attempt(self, use: Callable[[Any], None], transform: Any) -> None:
+        """Use one transform of a message. If it cannot be used, warn; the others may be fine."""
         try:
-            return poses.transform_matrix(transform.transform)
-        except MessageError as error:
-            self._warnings.warn('tf', f"the transform of '{transform.child_frame_id}' is ignored: {error}")
-            return None
+            use(transform)
+        except Exception as error:  # noqa: BLE001 - whatever a message holds, the next one may be fine
+            self._warnings.warn_of('tf', f"the transform of '{transform.child_frame_id}' is ignored", error)
 
 
 def _name(frame_id: str) -> str:

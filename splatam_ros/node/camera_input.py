@@ -69,8 +69,13 @@ class CameraInput:
 
     @property
     def is_stalled(self) -> bool:
-        """True if images wait for a better partner that will not come; a player may be waiting for our answer."""
+        """True if images wait for a better partner, or a frame for the next one, that does not come.
+
+        A player may be waiting for our answer.
+        """
         waiting = self._assembler.statistics
+        if self._assembler.is_stalled:
+            return self._quiet_s > QUIET_S
         if not (waiting.waiting_color and waiting.waiting_depth):
             return False
         return self._quiet_s > (QUIET_S if waiting.waiting_color == waiting.waiting_depth else LONG_QUIET_S)

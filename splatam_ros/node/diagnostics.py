@@ -13,6 +13,7 @@ from rclpy.node import Node
 
 from msg_adapters import stamps
 from msg_adapters.factory import MessageFactory, RclpyMessages, message_class
+from splatam_core.errors import FrameError
 from splatam_core.types import FrameResult, Status
 
 OK, WARN, ERROR = b'\x00', b'\x01', b'\x02'
@@ -48,7 +49,7 @@ class Sample:
         unpaired: number of images dropped because no partner came.
         waiting_frames: number of frames that wait for SLAM, or are being processed.
         dropped_frames: number of frames dropped because SLAM was busy.
-        refused_frames: number of frames that SLAM could not use.
+        refused_frames: number of frames that SLAM could not use, or that failed.
         frames: number of processed frames by status.
         poses: number of poses published.
         delay_s: time from the newest pose's stamp to its publication; None before the first pose.
@@ -79,6 +80,7 @@ class FrameCounters:
     Attributes:
         by_status: number of processed frames by status.
         refused: number of frames that SLAM could not use.
+        failed: number of frames for which SLAM or publishing failed.
         newest: result of the newest frame; None before the first.
         delay_s: time from the newest pose's stamp to its publication; None before the first pose.
         frame_id: frame id of the newest frame's colour image; empty before the first.
@@ -86,7 +88,7 @@ class FrameCounters:
 
     def __init__(self) -> None:
         self.by_status = dict.fromkeys(Status, 0)
-        self.refused = 0
+        self.refused = self.failed = 0
         self.newest: FrameResult | None = None
         self.delay_s: float | None = None
         self.frame_id = ''
@@ -95,6 +97,18 @@ class FrameCounters:
     def total(self) -> int:
         """Number of processed frames."""
         return sum(self.by_status.values())
+
+    @property
+    def bad(self) -> int:
+        """Number of frames that SLAM could not use, or that failed."""
+        return self.refused + self.failed
+
+    def add_bad(self, error: Exception) -> None:
+        """Count a frame that was refused, by a FrameError, or that failed, by any other error."""
+        if isinstance(error, FrameError):
+            self.refused += 1
+        else:
+            self.failed += 1
 
     def add(self, result: FrameResult, frame_id: str) -> None:
         """Count a processed frame."""

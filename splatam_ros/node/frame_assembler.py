@@ -9,14 +9,14 @@ from typing import Any, TypeVar
 
 from msg_adapters import camera_info, images, stamps
 from msg_adapters.camera_info import CameraParameters
-from msg_adapters.errors import MessageError
 from msg_adapters.synchronizer import RgbdSet, RgbdSynchronizer, SyncStatistics
-from splatam_core.errors import CameraError, FrameError
 from splatam_core.geometry.camera import CameraCalibration
+from splatam_core.geometry.trajectory import stamp_text
 from splatam_core.images.rectification import FrameFactory
 from splatam_core.types import RgbdFrame
 from splatam_ros.node.gate import FrameGate
 from splatam_ros.node.parameters import NodeOptions
+from splatam_ros.node.stamp_filter import StampFilter
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 T = TypeVar('T')
@@ -35,12 +35,13 @@ class FrameAssembler:
             options: the node's options.
             warnings: receives a warning about each input that is skipped.
             gate: decides about each frame before it is decoded.
-            on_rejected: called with the stamp (ns) of each frame that the gate rejects.
+            on_rejected: called with the stamp (ns) of each frame that the gate rejects, or whose stamp is wrong.
         """
+        jump_ns = round(options.time_jump_threshold * 1e9)
         self._synchronizer = RgbdSynchronizer(
-            options.sync_mode, round(options.sync_max_interval * 1e9), options.sync_queue_size,
-            round(options.time_jump_threshold * 1e9),
-        )  # fmt: skip
+            options.sync_mode, round(options.sync_max_interval * 1e9), options.sync_queue_size, jump_ns
+        )
+        self._stamps = StampFilter(jump_ns, self._drop_wrong_stamp)
         self._width = options.width or None
         self._is_rectified = not options.undistort
         self._decode_depth = partial(images.decode_depth, metres_per_count=options.depth_scale)
@@ -54,6 +55,11 @@ class FrameAssembler:
     def statistics(self) -> SyncStatistics:
         """Counts of received, paired and dropped messages."""
         return self._synchronizer.statistics
+
+    @property
+    def is_stalled(self) -> bool:
+        """True if a frame waits for the next one, to find out whether its stamp is right."""
+        return self._stamps.is_holding
 
     def add_color(self, message: Any) -> list[RgbdFrame]:
         """Add a colour image; returns the frames that it completes."""
@@ -73,7 +79,7 @@ class FrameAssembler:
 
     def flush(self) -> list[RgbdFrame]:
         """Returns the frames that can be assembled without further messages; unpaired images are dropped."""
-        return self._frames(self._synchronizer.flush())
+        return self._frames(self._synchronizer.flush()) + self._admitted(self._stamps.flush())
 
     def report_drops(self) -> None:
         """Warn about the messages that the synchronizer has dropped since the last report."""
@@ -90,8 +96,18 @@ class FrameAssembler:
             self._warnings.warn(f'dropped {kind}', f'{count} image{"s" if count > 1 else ""} dropped: {why}')
 
     def _frames(self, sets: list[RgbdSet]) -> list[RgbdFrame]:
-        frames = [self._frame(found) for found in sets if self._is_admitted(found)]
+        return self._admitted([right for found in sets for right in self._stamps.add(found)])
+
+    def _admitted(self, sets: list[RgbdSet]) -> list[RgbdFrame]:
+        frames = [self._attempt('frame', self._frame, found) for found in sets if self._is_admitted(found)]
         return [frame for frame in frames if frame is not None]
+
+    def _drop_wrong_stamp(self, found: RgbdSet, last_ns: int) -> None:
+        self._warnings.warn(
+            'wrong stamp', f'frame {stamp_text(found.stamp_ns)} skipped: its stamp is {(found.stamp_ns - last_ns) / 1e9:+.3f} s '
+            'from the frames around it; do the stamps increase, and come from one clock?',
+        )  # fmt: skip
+        self._on_rejected(found.stamp_ns)
 
     def _is_admitted(self, found: RgbdSet) -> bool:
         is_admitted = self._gate.admits(found.resets, found.stamp_ns)
@@ -134,8 +150,8 @@ class FrameAssembler:
         """Returns the function's result, or None after a warning if the input cannot be used."""
         try:
             return function(argument)
-        except (MessageError, CameraError, FrameError) as error:
-            self._warnings.warn(what, f'{what} skipped: {error}')
+        except Exception as error:  # noqa: BLE001 - whatever a message holds, the next one may be fine
+            self._warnings.warn_of(what, f'{what} skipped', error)
             return None
 
 

@@ -6,16 +6,19 @@ import argparse
 import logging
 import sys
 import textwrap
+import traceback
 from collections.abc import Sequence
 
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.rcutils_logger import RcutilsLogger
+from rclpy.logging import get_logger
 
 from splatam_core.errors import SplatamError
 from splatam_core.settings import Setting
 from splatam_ros.node.node import SplatamNode
 from splatam_ros.node.parameters import NODE_SETTINGS
-from splatam_ros.process import StopRequest, ros, split_arguments
+from splatam_ros.process import RosError, StopRequest, ros, split_arguments
+from splatam_ros.throttled_warnings import ThrottledWarnings, describe
 
 PROGRAM = 'splatam_node'
 EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
@@ -47,18 +50,39 @@ def run(for_ros: Sequence[str], stop: StopRequest) -> int:
         SplatamError: the node cannot start.
     """
     with ros(for_ros):
-        node = SplatamNode()
+        node = _start(stop)
         logging.getLogger().addHandler(RosLog(node.get_logger()))
         is_fine = False
         try:
             executor = SingleThreadedExecutor()
             executor.add_node(node)
-            while not (stop.requested or node.is_finished):
-                executor.spin_once(timeout_sec=SPIN_S)
+            _spin(executor, node, stop)
             executor.remove_node(node)
         finally:
-            is_fine = node.close(lambda: stop.requested)
+            is_fine = node.close()
     return EXIT_OK if is_fine else EXIT_FAILED
+
+
+def _start(stop: StopRequest) -> SplatamNode:
+    try:
+        return SplatamNode(stop)
+    except SplatamError:
+        raise
+    except Exception as error:  # noqa: BLE001 - of rclpy, say; one line is enough
+        get_logger(PROGRAM).debug(''.join(traceback.format_exception(error)))
+        raise RosError(f'the node cannot start: {describe(error)}') from None
+
+
+def _spin(executor: SingleThreadedExecutor, node: SplatamNode, stop: StopRequest) -> None:
+    """Run the callbacks until the end. One that fails costs its message or call, never the node."""
+    warnings = ThrottledWarnings(node.get_logger())
+    while not (stop.requested or node.is_finished):
+        try:
+            executor.spin_once(timeout_sec=SPIN_S)
+        except ExternalShutdownException:
+            return
+        except Exception as error:  # noqa: BLE001 - the other callbacks may be fine
+            warnings.warn_of('callback', 'a callback failed', error)
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -7,7 +7,6 @@ tells the others through explicit methods. Everything here runs on the worker's 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,8 @@ from numpy.typing import NDArray
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 from splatam_core.config import SlamConfig
-from splatam_core.errors import ConfigError
+from splatam_core.errors import ConfigError, MapFileError, SplatamError
+from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.maps.ply import read_ply
 from splatam_core.runs.layout import MAP
 from splatam_core.slam import Slam
@@ -23,10 +23,14 @@ from splatam_core.types import FrameResult, RgbdFrame, Status
 from splatam_ros.frames.rep105 import Located, parse_pose
 from splatam_ros.frames.robot_frames import RobotFrames
 from splatam_ros.node.outputs import Outputs
-from splatam_ros.node.parameters import NodeOptions
+from splatam_ros.node.parameters import NodeOptions, as_path
 from splatam_ros.node.run_recorder import RunRecorder
+from splatam_ros.process import StopRequest
 
 Matrix = NDArray[np.float64]
+
+FRAMES_OF_NEW_CAMERA = 2  # that follow each other; a single wrong CameraInfo must not cost the map
+SETTLED_S = 3.0  # time from the request to stop until the final fit, if nothing is in the way
 
 
 class MapLifecycle:
@@ -55,6 +59,8 @@ class MapLifecycle:
         self._epoch = 0
         self._T_map_world: Matrix | None = None  # set by the first located frame of a world
         self._lost_since_ns: int | None = None
+        self._other_camera: PinholeCamera | None = None
+        self._num_other = 0
         self._finish_s = 0.0
 
     @property
@@ -75,7 +81,7 @@ class MapLifecycle:
         if frame.epoch != self._epoch:
             self._epoch = frame.epoch
             self._jump_in_time(slam)
-        if slam.camera not in (None, frame.camera) and self._options.on_camera_change == 'reset':
+        if self._has_other_camera(slam, frame.camera):
             self.reset(slam, 'the camera changed')
 
     def record(self, frame: RgbdFrame, result: FrameResult) -> None:
@@ -102,12 +108,22 @@ class MapLifecycle:
         if 0 < self._options.lost_reset_after <= lost_s:
             self.reset(slam, f'lost for {lost_s:.1f} s')
 
+    def _has_other_camera(self, slam: Slam, camera: PinholeCamera) -> bool:
+        """Returns True if the camera has changed for good, or if there is no map yet that would be lost."""
+        if slam.camera in (None, camera):
+            self._other_camera, self._num_other = None, 0
+            return False
+        self._num_other = self._num_other + 1 if camera == self._other_camera else 1
+        self._other_camera = camera
+        may_reset = self._options.on_camera_change == 'reset' and self._num_other >= FRAMES_OF_NEW_CAMERA
+        return may_reset or slam.num_gaussians == 0
+
     def _jump_in_time(self, slam: Slam) -> None:
         if self._options.on_time_jump == 'reset':
             self.reset(slam, 'time jumped back')
             return
         self._logger.warning('time jumped back: continuing in the same map, from the last pose')
-        self._recorder.start_over(slam, saves_map=True)  # the stamps of a trajectory must increase
+        self._recorder.start_over(slam)  # the stamps of a trajectory must increase
         slam.rest()
         self._outputs.interrupt_motion()
 
@@ -123,28 +139,34 @@ class MapLifecycle:
         Returns:
             Message for the user.
         """
-        kept = self._recorder.start_over(slam, saves_map=True)
+        kept = self._recorder.start_over(slam)
         slam.reset()
         self._begin_world()
         self._logger.warning(f'map reset: {why}{kept}')
         return f'the next frame starts a new map{kept}'
 
     def load(self, slam: Slam) -> str:
-        """Continue in the map at ``load_path``, from ``load_pose``.
+        """Continue in the map at ``load_path``, from ``load_pose``. The run so far, with its map, is kept in ``previous/``.
 
         Returns:
             Message for the user.
 
         Raises:
-            SplatamError: there is no such map, or ``load_pose`` is not a pose; nothing has changed.
+            SplatamError: there is no such map, it does not fit the configuration, ``load_pose`` is not a pose, or the map
+                so far cannot be saved; nothing has changed.
         """
         path = map_path(self._options.load_path)
         T_world_cam = load_pose(self._options)
         gaussians = read_ply(path)
-        self._recorder.start_over(slam, saves_map=False)  # the path may be this run's own map, as saved last
+        try:
+            slam.check_map(gaussians)
+        except SplatamError as error:
+            raise MapFileError(f'{path}: {error}') from None
+        self._recorder.secure(slam)
         slam.load(gaussians, T_world_cam)
+        kept = self._recorder.start_over(slam, is_saved=True)
         self._begin_world()
-        message = f'loaded {len(gaussians)} Gaussians from {path}'
+        message = f'loaded {len(gaussians)} Gaussians from {path}{kept}'
         self._logger.info(message)
         return message
 
@@ -168,16 +190,20 @@ class MapLifecycle:
 
     # --- at shutdown ---
 
-    def finish(self, slam: Slam, is_hurried: Callable[[], bool]) -> None:
+    def finish(self, slam: Slam, stop: StopRequest) -> None:
         """Fit the map to all keyframes once more.
 
         Args:
             slam: has the map.
-            is_hurried: returns True if the process was asked to stop. If it is so from the start, fitting takes at most
-                ``finish_limit`` seconds; otherwise fitting ends when it is done, or when this becomes True.
+            stop: tells if the process was asked to stop. If it was before, fitting takes at most ``finish_limit`` seconds,
+                and less if the last frame has taken long; otherwise fitting ends when it is done, or at the request.
         """
-        hurried, begin = is_hurried(), time.monotonic()
-        steps = slam.finish(self._options.finish_limit) if hurried else slam.finish(stop=is_hurried)
+        begin = time.monotonic()
+        if stop.requested:
+            late_s = max(0.0, stop.elapsed_s - SETTLED_S)
+            steps = slam.finish(max(0.1, self._options.finish_limit - late_s))
+        else:
+            steps = slam.finish(stop=lambda: stop.requested)
         self._finish_s = time.monotonic() - begin
         if steps:
             self._logger.info(f'fitted the map to all keyframes once more: {steps} steps in {self._finish_s:.1f} s')
@@ -199,12 +225,20 @@ def map_path(text: str) -> Path:
     """Returns the PLY file that a path means: the file itself, or the map in a run's folder.
 
     Raises:
-        ConfigError: the path is empty.
+        ConfigError: the path is empty or cannot be used.
+        MapFileError: there is no regular file.
     """
     if not text:
         raise ConfigError('load_path is empty: set it to a map.ply, or to the folder of a run')
-    path = Path(text).expanduser()
-    return path / MAP if path.is_dir() else path
+    path = as_path('load_path', text)
+    try:
+        path = path / MAP if path.is_dir() else path
+        is_file, exists = path.is_file(), path.exists()
+    except OSError as error:
+        raise MapFileError(f'{path}: cannot be read: {error.strerror}') from None
+    if exists and not is_file:  # reading a pipe or a device may never end
+        raise MapFileError(f'{path}: cannot be read: it is no regular file; set load_path to a map.ply, or to the folder of a run')
+    return path
 
 
 def load_pose(options: NodeOptions) -> Matrix:

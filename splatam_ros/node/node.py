@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import traceback
 from collections.abc import Callable
 from functools import partial
 
@@ -11,7 +10,6 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from splatam_core.config import SlamConfig, apply_threads
-from splatam_core.errors import FrameError, SplatamError
 from splatam_core.geometry.trajectory import stamp_text
 from splatam_core.runs import provenance
 from splatam_core.slam import Slam
@@ -19,6 +17,7 @@ from splatam_core.types import FrameResult, RgbdFrame, Status
 from splatam_core.worker import SlamWorker, WorkerStopped
 from splatam_ros.frames.robot_frames import RobotFrames
 from splatam_ros.node import diagnostics, parameters
+from splatam_ros.node.attempt import attempt
 from splatam_ros.node.camera_input import CameraInput
 from splatam_ros.node.diagnostics import DiagnosticsPublisher, FrameCounters, InputSample, Sample
 from splatam_ros.node.frame_assembler import FrameAssembler
@@ -29,15 +28,13 @@ from splatam_ros.node.outputs import Outputs
 from splatam_ros.node.parameters import NodeOptions
 from splatam_ros.node.reconfiguration import Reconfiguration
 from splatam_ros.node.services import Services
+from splatam_ros.process import StopRequest
 from splatam_ros.subscription import unused_overrides
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 TICK_S = 0.2
 PROGRESS_S = 10.0
-
-
-def _always() -> bool:
-    return True
+DRAIN_S = 2.0  # of the 8 s that a node told to stop has; the final fit and saving need the rest
 
 
 class SplatamNode(Node):
@@ -50,8 +47,11 @@ class SplatamNode(Node):
         is_finished: True when the process should end: the recording is over, or SLAM failed.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, stop: StopRequest) -> None:
         """Declare the parameters and start everything.
+
+        Args:
+            stop: tells if the process was asked to stop.
 
         Raises:
             SplatamError: a parameter cannot be used, or there is no place to save to.
@@ -61,7 +61,8 @@ class SplatamNode(Node):
         options, logger = self.options, self.get_logger()
         apply_threads(config)
         self.is_finished = False
-        self._num_dropped = 0
+        self._stop = stop
+        self._num_dropped = self._num_given_up = 0
         self._progress_s = time.monotonic()
         self._counters = FrameCounters()
         self._warnings = ThrottledWarnings(logger)
@@ -88,6 +89,7 @@ class SplatamNode(Node):
             self._slam, self._on_result, self._on_bad_frame, queue_size=options.queue_size,
             when_full='block' if options.keeps_all else 'drop_oldest', before_frame=self._lifecycle.before_frame,
         )  # fmt: skip
+        self._late = self._worker.call(self._outputs.serve_late_subscribers)
         self._service_server = Services(self, self._worker, self._lifecycle, self._gate)
         self._reconfiguration = Reconfiguration(self, options, config, self._use_options, self._use_config)
         self._diagnostics = DiagnosticsPublisher(self, self._sample())
@@ -108,19 +110,23 @@ class SplatamNode(Node):
 
     def _submit(self, frame: RgbdFrame) -> None:
         try:
-            self._worker.submit(frame)
+            self._num_given_up += not self._worker.submit(frame, self._is_out_of_time)
         except WorkerStopped:  # ``close`` logs the cause
             self.is_finished = True
         else:
             self._watchdog.report_frame()
+
+    def _is_out_of_time(self) -> bool:
+        """True if frames that wait for SLAM must be dropped, so that the node ends in time."""
+        return self._stop.elapsed_s > DRAIN_S
 
     def _tick(self) -> None:
         if self._worker.pending:
             self._watchdog.postpone()
         elif self._camera.is_stalled:
             self._camera.flush()
-        elif self._outputs.has_late_subscriber:
-            self._worker.call(self._outputs.serve_late_subscribers)
+        elif self._outputs.has_late_subscriber and self._late.done():  # at most one call waits, however long a save takes
+            self._late = self._worker.call(self._outputs.serve_late_subscribers)
         self._report_drops()
         self._watchdog.check(self._camera.statistics, self.options)
         self._check_end()
@@ -157,7 +163,7 @@ class SplatamNode(Node):
             unpaired=statistics.unpaired_color + statistics.unpaired_depth,
             waiting_frames=self._worker.pending,
             dropped_frames=self._worker.dropped,
-            refused_frames=self._counters.refused,
+            refused_frames=self._counters.bad,
             frames=dict(self._counters.by_status),
             poses=self._outputs.num_poses,
             delay_s=self._counters.delay_s,
@@ -179,39 +185,37 @@ class SplatamNode(Node):
 
         self._worker.call(configure)
 
-    def close(self, is_hurried: Callable[[], bool] = _always) -> bool:
-        """Stop receiving, process what waits, save, and destroy the node.
-
-        Args:
-            is_hurried: returns True if someone waits for the process to end, and may kill it.
+    def close(self) -> bool:
+        """Stop receiving, process what waits, save, and destroy the node. After a request to stop, all within 8 s.
 
         Returns:
-            True if SLAM did not fail and everything was saved.
+            True if SLAM worked and everything was saved.
         """
-        self._camera.close()
+        is_fine = self._attempt('closing the subscriptions', self._camera.close)
         if self.options.keeps_all:
-            self._camera.flush()
-        is_fine = self._attempt('SLAM', partial(self._worker.stop, drain=self.options.keeps_all))
+            is_fine &= self._attempt('the last images', self._camera.flush)
+        is_fine &= self._attempt('SLAM', self._stop_worker)
         self._report_drops()
+        if self._counters.failed and not self._counters.total:
+            self.get_logger().error(f'SLAM failed for every frame ({self._counters.failed}); see above')
+            is_fine = False
         if self.options.folder is not None and self.options.save_on_shutdown:
             if self._worker.error is None:
-                is_fine &= self._attempt('the final fit of the map', partial(self._lifecycle.finish, self._slam, is_hurried))
+                is_fine &= self._attempt('the final fit of the map', partial(self._lifecycle.finish, self._slam, self._stop))
             is_fine &= self._attempt('saving', partial(self._lifecycle.save_at_end, self._slam))
         is_fine &= self._attempt('saving', self._lifecycle.close)
         self.destroy_node()
         return is_fine
 
+    def _stop_worker(self) -> None:
+        dropped = self._worker.stop(self.options.keeps_all, self._is_out_of_time)
+        if self.options.keeps_all and dropped + self._num_given_up:
+            self.get_logger().warning(
+                f'{dropped + self._num_given_up} frames that waited for SLAM were dropped, because the node was told to stop'
+            )
+
     def _attempt(self, what: str, action: Callable[[], object]) -> bool:
-        """Run a step of the shutdown. If it fails, log the error; the other steps run all the same."""
-        try:
-            action()
-        except (SplatamError, OSError) as error:
-            self.get_logger().error(f'{what} failed: {error}')
-        except Exception as error:  # noqa: BLE001 - the rest of the shutdown must run
-            self.get_logger().error(f'{what} failed:\n{"".join(traceback.format_exception(error))}')
-        else:
-            return True
-        return False
+        return attempt(self.get_logger(), what, action)
 
     # --- worker's thread ---
 
@@ -226,9 +230,9 @@ class SplatamNode(Node):
         self._log_progress(result)
         self._lifecycle.after_frame(self._slam, result)
 
-    def _on_bad_frame(self, frame: RgbdFrame, error: FrameError) -> None:
-        self._counters.refused += 1
-        self._warnings.warn('refused', f'frame {stamp_text(frame.stamp_ns)} skipped: {error}')
+    def _on_bad_frame(self, frame: RgbdFrame, error: Exception) -> None:
+        self._counters.add_bad(error)
+        self._warnings.warn_of(type(error).__name__, f'frame {stamp_text(frame.stamp_ns)} skipped', error)
         self._outputs.publish_processed(frame.stamp_ns)
 
     def _log_progress(self, result: FrameResult) -> None:

@@ -7,8 +7,11 @@ against the same tables, so the command line and ROS report the same errors.
 from __future__ import annotations
 
 import difflib
+import errno
+import os
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,13 +21,15 @@ from rclpy.node import Node
 
 from msg_adapters.synchronizer import Mode
 from splatam_core.config import SlamConfig, flat_values, load_config, settings
-from splatam_core.errors import ConfigError
-from splatam_core.settings import Setting, Value
+from splatam_core.errors import ConfigError, one_line
+from splatam_core.settings import Setting, Value, shown
 from splatam_ros.frames.options import FrameOptions
 
 SLAM = 'slam.'
 ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 MAX_INTEGER = 2**63 - 1
+MIN_WIDTH = 16
+MAX_NAME = 255  # bytes; of common file systems
 
 
 def _setting(
@@ -167,8 +172,12 @@ class NodeOptions:
 
     @property
     def folder(self) -> Path | None:
-        """Folder to save in; None = save nothing."""
-        return Path(self.save_path).expanduser() if self.save_path else None
+        """Folder to save in; None = save nothing.
+
+        Raises:
+            ConfigError: the path cannot be used; ``check_options`` finds that out.
+        """
+        return as_path('save_path', self.save_path) if self.save_path else None
 
     @property
     def keeps_all(self) -> bool:
@@ -189,6 +198,40 @@ class NodeOptions:
             odom_source=self.odom_source,
             odom_max_wait_s=self.odom_max_wait,
         )
+
+
+def as_path(name: str, text: str) -> Path:
+    """Returns a path that a user gave; ``~`` is the home folder.
+
+    Args:
+        name: name of the parameter, for the error message.
+        text: its value.
+
+    Raises:
+        ConfigError: no file can have that path.
+    """
+    try:
+        path = Path(text).expanduser()
+        with suppress(FileNotFoundError, NotADirectoryError):
+            path.stat()
+        if any(len(os.fsencode(part)) > MAX_NAME for part in path.parts):  # of a folder that is still to be made
+            raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
+    except (OSError, RuntimeError, ValueError) as error:  # too long, no such user, a NUL
+        why = error.strerror if isinstance(error, OSError) else one_line(error)
+        raise ConfigError(f'{name} = {shown(text)}: cannot be used as a path: {why}; choose another') from None
+    return path
+
+
+def check_options(options: NodeOptions) -> None:
+    """Check what the bounds of single parameters cannot say.
+
+    Raises:
+        ConfigError: a value is not allowed.
+    """
+    for name in ('save_path', 'save_root', 'load_path', 'preset'):
+        as_path(name, getattr(options, name))
+    if 0 < options.width < MIN_WIDTH:
+        raise ConfigError(f'width = {options.width}: expected 0 (keep the size), or at least {MIN_WIDTH} (px)')
 
 
 def field_name(name: str) -> str:
@@ -238,6 +281,7 @@ def declare(node: Node) -> tuple[NodeOptions, SlamConfig]:
     found: Mapping[str, Any] = node.get_parameters_by_prefix('')
     given = {name: parameter.value for name, parameter in found.items()}
     own = _checked(given)
+    check_options(node_options(own))
     _check_names(node, given)
     slam = {name.removeprefix(SLAM): value for name, value in given.items() if name.startswith(SLAM)}
     config = _load(str(own['preset']), slam)
@@ -269,12 +313,20 @@ def _load(preset: str, slam: Mapping[str, object]) -> SlamConfig:
 
 def _check_names(node: Node, given: Mapping[str, object]) -> None:
     """Warn about unknown parameters. They are no error, since a file for several nodes may contain those of others."""
-    known = [setting.name for setting in NODE_SETTINGS]
     for name in given:
-        if name not in known and not name.startswith((SLAM, *ROS_OWN)):
-            close = difflib.get_close_matches(name, known, n=1)
-            hint = f"; did you mean '{close[0]}'?" if close else ''
-            node.get_logger().warning(f"unknown parameter '{name}' is ignored{hint}")
+        if not is_known(name):
+            node.get_logger().warning(f"unknown parameter '{name}' is ignored{similar_name(name)}")
+
+
+def is_known(name: str) -> bool:
+    """Returns True if a parameter is one of the node, of SLAM or of ROS itself."""
+    return name in (setting.name for setting in NODE_SETTINGS) or name.startswith((SLAM, *ROS_OWN))
+
+
+def similar_name(name: str) -> str:
+    """Returns which of the node's parameters has a similar name, as the end of a sentence; empty if none has."""
+    close = difflib.get_close_matches(name, [setting.name for setting in NODE_SETTINGS], n=1)
+    return f"; did you mean '{close[0]}'?" if close else ''
 
 
 def _declare(node: Node, name: str, setting: Setting, value: Value) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
@@ -12,11 +11,23 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from splatam_core.config import SlamConfig, check_effect, with_values
-from splatam_core.errors import ConfigError, SplatamError
+from splatam_core.errors import ConfigError
 from splatam_core.lifecycle import check_truth
 from splatam_core.runs.layout import check_is_free
+from splatam_core.settings import shown
+from splatam_ros.node.attempt import why
 from splatam_ros.node.map_lifecycle import load_pose
-from splatam_ros.node.parameters import NODE_SETTINGS, SLAM, NodeOptions, field_name, why_fixed
+from splatam_ros.node.parameters import (
+    NODE_SETTINGS,
+    SLAM,
+    NodeOptions,
+    as_path,
+    check_options,
+    field_name,
+    is_known,
+    similar_name,
+    why_fixed,
+)
 
 SETTINGS = {setting.name: setting for setting in NODE_SETTINGS}
 
@@ -56,11 +67,12 @@ class Reconfiguration:
                 _check_may_change(change.name)
             options, config = self._changed(changes)
             check_truth(config, None)
+            check_options(options)
             if options.save_path != self.options.save_path:
                 check_save_path(options)
             load_pose(options)
-        except SplatamError as error:
-            return SetParametersResult(successful=False, reason=str(error))
+        except Exception as error:  # noqa: BLE001 - whatever is wrong with a value, the node continues with the old one
+            return SetParametersResult(successful=False, reason=why(error))
         return SetParametersResult(successful=True)
 
     def _apply(self, changes: Sequence[Parameter]) -> None:
@@ -83,6 +95,8 @@ class Reconfiguration:
 
 
 def _check_may_change(name: str) -> None:
+    if not is_known(name):
+        raise ConfigError(f"unknown parameter '{name}'{similar_name(name)}")
     if (name in SETTINGS or name.startswith(SLAM)) and (why := why_fixed(name)):
         raise ConfigError(f'{name} cannot change while the node runs: {why}')
 
@@ -96,8 +110,8 @@ def check_save_path(options: NodeOptions) -> None:
     """
     if not options.save_root:
         raise ConfigError('save_path cannot change while the node runs: save_root is empty; start the node with it set')
-    root = Path(options.save_root).expanduser().resolve()
+    root = as_path('save_root', options.save_root).resolve()
     path = options.folder
     if path is None or root not in path.resolve().parents:  # with links resolved
-        raise ConfigError(f"save_path = '{options.save_path}': expected a folder below save_root, which is {root}")
+        raise ConfigError(f'save_path = {shown(options.save_path)}: expected a folder below save_root, which is {root}')
     check_is_free(path)

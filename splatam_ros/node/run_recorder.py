@@ -7,12 +7,13 @@ from pathlib import Path
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 from splatam_core.config import SlamConfig
-from splatam_core.errors import ConfigError, RunFolderError
+from splatam_core.errors import ConfigError, RunFolderError, SplatamError
 from splatam_core.runs.metrics import Metrics
 from splatam_core.runs.record import RunDescription
 from splatam_core.runs.writer import RunFolder
 from splatam_core.slam import Slam
 from splatam_core.types import FrameResult, RgbdFrame
+from splatam_ros.node.attempt import why
 from splatam_ros.node.parameters import NodeOptions
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
@@ -56,9 +57,8 @@ class RunRecorder:
             return
         try:
             self._folder.append(frame, result, result.timings.total / 1e3)
-        except OSError as error:
-            why = f'a frame could not be recorded: {error.strerror}'
-            self._warnings.warn('trajectory', f'{self._folder.path}: {why}')
+        except Exception as error:  # noqa: BLE001 - whatever happened to the folder, SLAM continues
+            self._warnings.warn('trajectory', f'{self._folder.path}: a frame could not be recorded: {why(error)}')
 
     def save(self, slam: Slam, finish_s: float = 0.0) -> Metrics:
         """Save map, trajectory and metrics in ``save_path``.
@@ -102,14 +102,31 @@ class RunRecorder:
         folder.discard()
         self._logger.info(f'no frame was received, so nothing is saved in {folder.path}')
 
-    def start_over(self, slam: Slam, *, saves_map: bool) -> str:
-        """Start a new run in the same folder. The run so far moves to ``previous/``.
+    def secure(self, slam: Slam) -> None:
+        """Save the map of the run so far, before something replaces it on request.
+
+        Args:
+            slam: has the map.
+
+        Raises:
+            RunFolderError: it cannot be saved.
+        """
+        if self._folder is None or self._folder.is_empty:
+            return
+        try:
+            self._folder.save(slam)
+        except (OSError, SplatamError) as error:
+            reason = f'the map so far cannot be saved: {why(error)}; nothing has changed, make room and try again'
+            raise RunFolderError(f'{self._folder.path}: {reason}') from None
+
+    def start_over(self, slam: Slam, *, is_saved: bool = False) -> str:
+        """Start a new run in the same folder. The run so far, with its map, moves to ``previous/``.
 
         If the disk fails, log the error and continue without recording.
 
         Args:
-            slam: has the map of the run so far.
-            saves_map: True to save that map first.
+            slam: has the map of the run so far, unless that is saved already.
+            is_saved: True if ``secure`` has saved it.
 
         Returns:
             Where the run so far is, as the end of a sentence; empty if nothing is recorded.
@@ -117,15 +134,15 @@ class RunRecorder:
         if self._folder is None:
             return ''
         if not self._folder.is_empty:
-            self._move_to_previous(self._folder, slam, saves_map)
+            self._move_to_previous(self._folder, slam, is_saved)
         return f'; the run so far is in {self._folder.path / "previous"}' if self._folder else ''
 
-    def _move_to_previous(self, folder: RunFolder, slam: Slam, saves_map: bool) -> None:
+    def _move_to_previous(self, folder: RunFolder, slam: Slam, is_saved: bool) -> None:
         try:
-            if saves_map:
+            if not is_saved:
                 folder.save(slam)
-        except OSError as error:
-            self._logger.error(f'{folder.path}: the map before the reset could not be saved: {error.strerror}')
+        except (OSError, SplatamError) as error:
+            self._logger.error(f'{folder.path}: the map before the reset could not be saved: {why(error)}')
         try:
             self._folder = folder.restarted(slam.config)
         except RunFolderError as error:

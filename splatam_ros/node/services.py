@@ -14,6 +14,7 @@ from std_srvs.srv import Trigger
 from splatam_core.errors import SplatamError
 from splatam_core.slam import Slam
 from splatam_core.worker import SlamWorker
+from splatam_ros.node.attempt import why
 from splatam_ros.node.gate import FrameGate
 from splatam_ros.node.map_lifecycle import MapLifecycle
 
@@ -110,11 +111,12 @@ class Services:
         error = done.exception()
         if error is None:
             return _succeeded(done.result())
-        if isinstance(error, OSError):
-            return _failed(f'{error.filename}: {error.strerror}' if error.filename else str(error))
-        if not isinstance(error, SplatamError):
-            self._node.get_logger().error(''.join(traceback.format_exception(error)))
-        return _failed(str(error))
+        if not isinstance(error, Exception):
+            return _failed(f'SLAM has stopped: {error!r}')
+        if not isinstance(error, (SplatamError, OSError)):
+            self._node.get_logger().error(f'a service failed: {why(error)}; the traceback is logged at level debug')
+            self._node.get_logger().debug(''.join(traceback.format_exception(error)))
+        return _failed(why(error))
 
 
 def _handler(action: Callable[[], Awaitable[Trigger.Response]]) -> Callable[..., Awaitable[Trigger.Response]]:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import resource
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from camera import Live, position, still
 from control import Control
 from graph import Graph
@@ -15,6 +19,7 @@ from splatam_core.config import load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
 from splatam_core.geometry.trajectory import pose_line
 from splatam_core.maps.ply import read_ply, write_ply
+from splatam_core.rasterizer import Gaussians
 from splatam_core.runs.record import read_run
 from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame
@@ -107,11 +112,81 @@ def test_a_saved_map_is_localised_in(graph: Graph, frames: SyntheticSequence, sa
 
     control.change(load_path=str(graph.folder / 'nowhere.ply'))
     assert 'nowhere.ply: cannot be read' in control.fail('load_map')
+    live_map = read_ply(out / 'map.ply').means.shape
     control.change(load_path=str(saved_map), load_pose='', slam__mapping__enabled=False)
-    assert str(saved_map) in control.succeed('load_map')
+    message = control.succeed('load_map')
+    assert str(saved_map) in message and 'the run so far is in' in message
+    assert read_ply(out / 'previous' / 'map.ply').means.shape == live_map  # as after a reset
     pose = live.show(replace(frames[0], stamp_ns=21 * SECOND))
     assert pose is not None and np.linalg.norm(position(pose)) < STILL_M
     assert [len(read_run(path).trajectory) for path in (out, out / 'previous')] == [1, 2]
+
+
+def fifo(folder: Path) -> Path:
+    os.mkfifo(folder / 'pipe.ply')
+    return folder / 'pipe.ply'
+
+
+def run_with_fifo(folder: Path) -> Path:
+    (folder / 'other_run').mkdir()
+    os.mkfifo(folder / 'other_run' / 'map.ply')
+    return folder / 'other_run'
+
+
+def anisotropic(folder: Path) -> Path:
+    gaussians = Gaussians(
+        means=torch.zeros(5, 3), log_scales=torch.arange(15.0).reshape(5, 3) / 9, logit_opacities=torch.zeros(5),
+        rgb=torch.ones(5, 3), rotations=torch.ones(5, 4),
+    )  # fmt: skip
+    write_ply(folder / 'anisotropic.ply', gaussians)
+    return folder / 'anisotropic.ply'
+
+
+def empty(folder: Path) -> Path:
+    zero = torch.zeros
+    write_ply(folder / 'empty.ply', Gaussians(means=zero(0, 3), log_scales=zero(0, 1), logit_opacities=zero(0), rgb=zero(0, 3)))
+    return folder / 'empty.ply'
+
+
+UNUSABLE_MAPS: dict[str, Callable[[Path], Path]] = {
+    'no regular file': fifo,
+    'cannot be read: ': run_with_fifo,
+    'it is no regular': lambda folder: Path('/dev/zero'),
+    'anisotropic': anisotropic,
+    'no Gaussians': empty,
+    'nowhere.ply: cannot be read': lambda folder: folder / 'nowhere.ply',
+}
+
+
+def test_a_map_that_cannot_be_loaded_leaves_everything_as_it_is(graph: Graph, frames: SyntheticSequence) -> None:
+    out = graph.folder / 'run'
+    live = Live(graph, save_path=out, queue_policy='all')
+    control = Control(graph)
+    assert live.show(still(frames, 0)) and live.show(still(frames, 1))
+    control.succeed('save_map')
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    for message, make in UNUSABLE_MAPS.items():
+        control.change(load_path=str(make(graph.folder)))
+        why = control.fail('load_map')
+        assert message in why and '\n' not in why
+        assert {path.name: path.read_bytes() for path in out.iterdir()} == before, message
+    assert live.show(still(frames, 2))  # in the same map
+    assert '3 frames' in control.succeed('save_map') and not (out / 'previous').exists()
+    assert 'Traceback' not in live.node.text
+
+
+def test_a_live_map_that_cannot_be_saved_is_not_replaced(graph: Graph, frames: SyntheticSequence, saved_map: Path) -> None:
+    out = graph.folder / 'run'
+    live = Live(graph, save_path=out, queue_policy='all')
+    control = Control(graph)
+    assert live.show(still(frames, 0))
+    control.change(load_path=str(saved_map))
+    resource.prlimit(live.node.pid, resource.RLIMIT_FSIZE, (50, resource.RLIM_INFINITY))
+    assert 'the map so far cannot be saved: ' in control.fail('load_map')
+    resource.prlimit(live.node.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    assert live.show(still(frames, 1)) and not live.node.says('loaded')
+    assert 'the run so far is in' in control.succeed('load_map')
+    assert len(read_run(out / 'previous').trajectory) == 2
 
 
 def test_localising_without_a_map_says_so(graph: Graph, frames: SyntheticSequence) -> None:
@@ -153,6 +228,17 @@ def test_a_rate_is_kept_on_average_whatever_the_jitter(jitter_ns: int) -> None:
     stamps_ns = [number * 33_333_333 + (number % 2) * jitter_ns for number in range(300)]  # 10 s at 30 Hz
     admitted = [stamp_ns for stamp_ns in stamps_ns if gate.admits(0, stamp_ns)]
     assert 99 <= len(admitted) <= 101
+
+
+def test_a_new_rate_holds_at_once() -> None:
+    gate = FrameGate(max_rate_hz=0.001)
+    assert gate.admits(0, SECOND) and not gate.admits(0, 2 * SECOND)
+    gate.max_rate_hz = 2.0
+    assert [gate.admits(0, 2 * SECOND + number * SECOND // 4) for number in range(4)] == [True, False, True, False]
+    gate.max_rate_hz = 0.001
+    assert not gate.admits(0, 5 * SECOND)
+    gate.max_rate_hz = 0.0
+    assert gate.admits(0, 5 * SECOND)
 
 
 def test_a_gate_follows_time_back() -> None:

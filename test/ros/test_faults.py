@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import array
+import itertools
 import resource
 import signal
+import struct
+import zlib
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -187,6 +192,70 @@ def test_a_stamp_that_jumps_and_returns(graph: Graph, frames: SyntheticSequence)
     assert np.linalg.norm(position(live.poses[-1])) < STILL_M
 
 
+def test_one_frame_stamped_a_day_ahead_costs_itself(graph: Graph, frames: SyntheticSequence) -> None:
+    """Also if only one of its images is; neither a day behind costs the map."""
+    live = Live(graph, queue_policy='all')
+    numbers = itertools.count()
+    for delta_ns, streams in ((86400 * SECOND, ('rgb', 'depth')), (86400 * SECOND, ('rgb',)), (-86400 * SECOND, ('rgb', 'depth'))):
+        assert live.show(still(frames, next(numbers)))
+        assert live.show(still(frames, next(numbers)))
+        wrong = replace(frames[6], stamp_ns=still(frames, next(numbers)).stamp_ns + delta_ns)
+        live.camera.send(wrong, only=('info', *streams))
+        assert live.show(still(frames, next(numbers)))
+        assert live.pose_of(wrong.stamp_ns) is None
+    assert live.node.says('WARN', 'its stamp is +86400.100 s from the frames around it')
+    assert not live.node.says('map reset') and not live.node.says('time jumped')
+
+
+def claims(data: bytes, width: int, height: int) -> array.array[int]:
+    """Returns a PNG whose header states another size."""
+    header = b'IHDR' + struct.pack('>II', width, height) + data[24:29]
+    return array.array('B', data[:12] + header + struct.pack('>I', zlib.crc32(header)) + data[33:])
+
+
+def odd_frame(number: int, width: int, height: int) -> RgbdFrame:
+    rgb = np.random.default_rng(number).integers(0, 255, (height, width, 3), np.uint8)
+    camera: Any = SimpleNamespace(width=width, height=height, fx=50.0, fy=50.0, cx=width / 2, cy=height / 2)  # checks nothing
+    return RgbdFrame(SECOND + number * 10**8, rgb, np.full((height, width), 2.0, np.float32), camera)
+
+
+def test_no_message_ends_the_node(graph: Graph, frames: SyntheticSequence) -> None:
+    """Stamps that are no times, odd sizes, and sizes beyond what OpenCV can rectify: each costs itself."""
+    live = Live(graph, queue_policy='all', slam__tracking__min_inlier_fraction=0.5, on_camera_change='refuse')
+    first = odd_frame(0, 64, 1)
+    live.camera.send(first)  # not even as the first frame
+    graph.spin_for(0.5)
+    assert live.show(still(frames, 1))
+    for stream in ('rgb', 'depth', 'info'):
+        messages = live.camera.messages(still(frames, 2), still(frames, 2).stamp_ns)
+        messages[stream].header.stamp.sec, messages[stream].header.stamp.nanosec = 2147483647, 4294967295
+        live.camera.publish(messages)
+    live.wait_says('WARN', '/rgb/image: a message is skipped: stamp', '4294967295')
+    assert live.show(still(frames, 3))
+    bent = {'info__distortion_model': 'plumb_bob', 'info__d': [-0.2, 0.05, 0.0, 0.0, 0.0]}
+    live.camera.send(odd_frame(4, 40000, 2), **bent)
+    live.wait_says('WARN', 'skipped', '40000x2')
+    for number, size in enumerate(((64, 1), (1, 64), (1, 1), (3, 2), (64, 1)), start=5):
+        live.camera.send(odd_frame(number, *size))
+    pose = live.show(still(frames, 20))
+    assert pose is not None and np.linalg.norm(position(pose)) < STILL_M
+    assert 'Traceback' not in live.node.text and not live.node.says('map reset: the camera changed', 'run so far')
+
+
+def test_images_that_claim_to_be_huge(graph: Graph, frames: SyntheticSequence) -> None:
+    live = Live(graph, camera_class=CompressedCamera, queue_policy='all', **CompressedCamera.PARAMETERS)
+    live.camera.color = 'png'
+    assert live.show(still(frames, 0))
+    for number, (stream, side) in enumerate((('rgb', 40000), ('depth', 40000), ('rgb', 20000)), start=1):
+        messages = live.camera.messages(still(frames, number), still(frames, number).stamp_ns)
+        data, before = bytes(messages[stream].data), 12 * (stream == 'depth')
+        messages[stream].data = array.array('B', data[:before]) + claims(data[before:], side, side)
+        live.camera.publish(messages)
+    assert live.show(still(frames, 9))
+    assert live.node.says('WARN', 'colour skipped') and live.node.says('WARN', 'depth skipped')
+    assert 'Traceback' not in live.node.text
+
+
 def _shows_pose(live: Live, frame: RgbdFrame) -> bool:
     live.camera.send(frame)
     return live.pose_of(frame.stamp_ns) is not None
@@ -225,6 +294,20 @@ def test_a_disk_that_is_full(graph: Graph, frames: SyntheticSequence) -> None:
     assert len(read_run(out).trajectory) == 7  # including the frames that could not be written then
     live.node.send(signal.SIGINT)
     assert live.node.wait() == 0
+
+
+def test_a_disk_that_is_full_at_the_first_frame(graph: Graph, frames: SyntheticSequence) -> None:
+    """With space again nothing is missing, the camera included."""
+    out = graph.folder / 'run'
+    live = Live(graph, save_path=out, queue_policy='all')
+    control = Control(graph)
+    limit_file_size(live.node, 50)
+    assert live.show(still(frames, 0)) and live.show(still(frames, 1))
+    limit_file_size(live.node, resource.RLIM_INFINITY)
+    assert live.show(still(frames, 2))
+    assert '3 frames' in control.succeed('save_map')
+    run = read_run(out)
+    assert run.camera == frames[0].camera and len(run.trajectory) == len(run.frames) == 3
 
 
 SLOW_DISK = """
@@ -273,6 +356,16 @@ UNUSABLE = {
     'max_rate_hz:=-1.0': 'max_rate_hz = -1.0: expected a number at least 0 and at most 1000 (Hz)',
     'slam.depth.min_m:=-2.0': 'depth.min_m = -2.0: expected a number at least 0 (m)',
     'load_path:=/nowhere.ply': '/nowhere.ply: cannot be read',
+    'load_path:=/dev/zero': '/dev/zero: cannot be read: it is no regular file',
+    f'save_path:=/tmp/{"x" * 300}': 'cannot be used as a path: File name too long',
+    'save_path:=~nosuchuser/x': "save_path = '~nosuchuser/x': cannot be used as a path",
+    'save_root:=~nosuchuser/x': "save_root = '~nosuchuser/x': cannot be used as a path",
+    'load_path:=~nosuchuser/x.ply ': 'cannot be used as a path',
+    f'preset:=/{"x" * 300}.yaml': 'cannot be used as a path',
+    'slam.keyframes.overlap_samples:=1000000000000000': 'overlap_samples = 1000000000000000: expected a whole number at least 1',
+    'slam.mapping.iterations:=9000000000000000000': 'mapping.iterations = 9000000000000000000: expected',
+    'finish_limit:=.inf': 'finish_limit = inf: expected a number',
+    'width:=7': 'width = 7: expected 0',
     "load_pose:='1 2'": "expected 'x y z qx qy qz qw'",
 }
 

@@ -99,12 +99,27 @@ def test_a_time_jump_is_handled_once_and_as_configured(policy: str, slam: str, o
     assert (bench.slam.calls, bench.outputs.calls) == ([slam], [outputs])
 
 
+OTHER_CAMERA = replace(CAMERA, fx=5.0)
+
+
 @pytest.mark.parametrize(('policy', 'calls'), [('reset', ['reset']), ('refuse', [])])
 def test_another_camera(policy: str, calls: list[str]) -> None:
     bench = Bench(on_camera_change=policy)
-    bench.feed()
-    bench.feed(camera=replace(CAMERA, fx=5.0))
+    for camera in (CAMERA, OTHER_CAMERA, CAMERA, replace(CAMERA, fy=5.0), OTHER_CAMERA):
+        bench.feed(camera=camera)
+    assert bench.slam.calls == []  # a single wrong CameraInfo costs its frame, never the map
+    bench.feed(camera=OTHER_CAMERA)
     assert bench.slam.calls == calls
+
+
+@pytest.mark.parametrize('policy', ['reset', 'refuse'])
+def test_a_camera_without_a_map_is_not_kept(policy: str) -> None:
+    """A first frame that could not be used must not decide which camera the others have to have."""
+    bench = Bench(on_camera_change=policy)
+    bench.slam.num_gaussians = 0
+    bench.feed(Status.LOST)
+    bench.feed(camera=OTHER_CAMERA)
+    assert bench.slam.calls == ['reset']
 
 
 def test_a_camera_that_is_lost_for_long_starts_another_map() -> None:

@@ -319,15 +319,62 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-def test_when_slam_breaks_what_is_done_is_saved(graph: Graph, bag: Path) -> None:
+def test_when_slam_breaks_it_costs_one_frame(graph: Graph, bag: Path, frames: SyntheticSequence) -> None:
     out = graph.folder / 'run'
-    node = graph.start('-c', BREAKS, *node_arguments(preset='quick', save_path=out, **SLAM))
+    arguments = node_arguments('--log-level', 'splatam:=debug', preset='quick', save_path=out, exit_on_publisher_end=True, **SLAM)
+    node = graph.start('-c', BREAKS, *arguments)
     player = graph.play(str(bag), '--wait-for')
-    assert node.wait() == 1, node.text
-    assert node.says('ZeroDivisionError: something nobody thought of'), node.text
-    assert len(read_run(out).trajectory) == 3 and (out / 'map.ply').is_file() and (out / 'metrics.json').is_file()
-    assert player.wait() == 1
-    assert player.says('left in mid-playback', '(image 4)')
+    assert (player.wait(), node.wait()) == (0, 0), player.text + node.text
+    (warning,) = [line for line in node.lines if '[WARN]' in line]
+    assert 'skipped: unexpected ZeroDivisionError: something nobody thought of' in warning
+    assert node.text.count('Traceback') == 1 and node.says('[DEBUG]', 'Traceback')
+    expected = [frame.stamp_ns for number, frame in enumerate(frames, 1) if number != 4]
+    assert read_run(out).trajectory.stamps_ns.tolist() == expected
+
+
+def test_when_slam_breaks_for_every_frame_the_exit_code_says_so(graph: Graph, frames: SyntheticSequence) -> None:
+    camera, done = Camera(graph), graph.collect(Header, '/splatam/processed')
+    node = graph.start('-c', BREAKS.replace('count == 4', 'True'), *node_arguments(preset='quick', **SLAM))
+    camera.wait_matched()
+    for count in (1, 2):
+        camera.send(frames[count - 1])
+        graph.spin_until(lambda: len(done) == count, explain=lambda: node.text)  # noqa: B023
+    node.send(signal.SIGINT)
+    assert node.wait() == 1 and node.says('ERROR', 'SLAM failed for every frame (2)') and 'Traceback' not in node.text
+
+
+SLOW = """
+import sys, time
+from splatam_core.slam import Slam
+works = Slam.process
+def process(self, frame):
+    time.sleep(0.4)
+    return works(self, frame)
+Slam.process = process
+from splatam_ros.node.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_node_told_to_stop_drops_what_it_has_no_time_for(graph: Graph, frames: SyntheticSequence, number: signal.Signals) -> None:
+    """A hundred frames of 0.4 s wait, in the queue and in the transport. The rest of the 8 s is for the final fit and saving."""
+    out = graph.folder / 'run'
+    camera, done = Camera(graph), graph.collect(Header, '/splatam/processed')
+    arguments = node_arguments(preset='realtime', save_path=out, queue_policy='all', queue_size=1000, slam__threads=1)
+    node = graph.start('-c', SLOW, *arguments)
+    camera.wait_matched()
+    for index in range(100):
+        camera.send(still(frames, index))
+    graph.spin_until(lambda: len(done) >= 2, explain=lambda: node.text)
+    before = len(done)
+    node.send(number)
+    assert node.wait() == 0, node.text
+    assert node.says('WARN', 'frames that waited for SLAM were dropped, because the node was told to stop')
+    run = read_run(out)
+    assert before <= len(run.frames) < before + 12  # two seconds of frames, and those whose answer was on its way
+    assert json.loads((out / 'metrics.json').read_text())['frames'] == len(run.frames)
+    assert len(read_ply(out / 'map.ply').means) > 500
 
 
 def test_a_folder_that_vanishes_is_one_error_at_the_end(graph: Graph, frames: SyntheticSequence) -> None:

@@ -143,6 +143,15 @@ def test_what_may_change_at_run_time_is_handed_on(make_node: MakeNode) -> None:
         ({'load_pose': '1 2 3'}, "load_pose = '1 2 3': expected 'x y z qx qy qz qw'"),
         ({'load_pose': '1 2 3 0 0 0 0'}, "load_pose = '1 2 3 0 0 0 0': expected"),
         ({'slam__depth__min_m': 200.0}, 'expected less than depth.max_m'),
+        ({'load_pose': '1e300 2 3 0 0 0'}, "load_pose = '1e300 2 3 0 0 0': expected"),
+        ({'load_pose': '1 2 3 0 0 0 1e-200'}, 'expected'),
+        ({'load_path': '~nosuchuser/x.ply'}, "load_path = '~nosuchuser/x.ply': cannot be used as a path"),
+        ({'load_path': '/' + 'x' * 300}, 'cannot be used as a path: File name too long'),
+        ({'load_path': '/tmp/a\0b'}, 'cannot be used as a path'),
+        ({'slam__keyframes__overlap_samples': 10**15}, 'slam.keyframes.overlap_samples out of range'),
+        ({'slam__mapping__means_rate': float('nan')}, 'means_rate'),
+        ({'slam__mapping__means_rate': float('inf')}, 'means_rate'),
+        ({'finish_limit': float('inf')}, 'finish_limit'),
     ],
 )  # fmt: skip
 def test_what_may_not_change_at_run_time_is_refused_with_the_reason(
@@ -155,6 +164,33 @@ def test_what_may_not_change_at_run_time_is_refused_with_the_reason(
     assert changes.node.get_parameter('no_data_timeout').value == 5.0
 
 
+@pytest.mark.parametrize(
+    'name', [*(f'slam.{setting.name}' for setting in settings()), *(setting.name for setting in NODE_SETTINGS)]
+)
+def test_no_value_of_any_parameter_raises(make_node: MakeNode, name: str) -> None:
+    """Whatever is set at run time is accepted or refused with a reason in one line."""
+    changes = Changes(make_node(save_root='/nowhere/at/all'))
+    setting = next(item for item in (*settings(), *NODE_SETTINGS) if item.name == name.removeprefix('slam.'))
+    odd = {
+        int: [2**63 - 1, -(2**63), 0], float: [1e308, -1e308, 5e-324, float('nan'), float('inf'), 0.0], bool: [True, False],
+        str: ['', 'x' * 100_000, '~nosuchuser/x', '/' + 'x' * 300, '/nowhere/at/all/' + 'x' * 300, 'a\0b', '\n'],
+    }[setting.type]  # fmt: skip
+    for value in odd:
+        result = changes.node.set_parameters_atomically([Parameter(name, value=value)])
+        assert result.successful or (result.reason and '\n' not in result.reason), (value, result.reason)
+
+
+def test_every_whole_number_has_an_upper_bound() -> None:
+    unbounded = [setting.name for setting in (*settings(), *NODE_SETTINGS) if setting.type is int and setting.maximum is None]
+    assert unbounded == []
+
+
+def test_a_parameter_that_nobody_knows_is_refused_at_run_time(make_node: MakeNode) -> None:
+    changes = Changes(make_node(max_rate_hzz=5.0))  # at start a warning, since a file may be for several nodes
+    result = changes.set(max_rate_hzz=6.0)
+    assert not result.successful and "unknown parameter 'max_rate_hzz'; did you mean 'max_rate_hz'?" in result.reason
+
+
 def test_a_folder_to_save_in_may_change_below_the_root_only(make_node: MakeNode, tmp_path: Path) -> None:
     root, outside = tmp_path / 'root', tmp_path / 'outside'
     for folder in (root / 'full', outside):
@@ -165,6 +201,9 @@ def test_a_folder_to_save_in_may_change_below_the_root_only(make_node: MakeNode,
     for path in (outside / 'run', root, root / '..' / 'outside' / 'run', root / 'link' / 'run'):
         result = changes.set(save_path=str(path))
         assert not result.successful and 'expected a folder below save_root' in result.reason, path
+    for path in (root / ('x' * 300), root / 'a\0b', root / '~nosuchuser' / ('x' * 300)):
+        result = changes.set(save_path=str(path))
+        assert not result.successful and 'cannot be used as a path' in result.reason, path
     result = changes.set(save_path=str(root / 'full'))
     assert not result.successful and 'choose another folder' in result.reason
     assert changes.set(save_path=str(root / 'new' / 'run')).successful
