@@ -34,7 +34,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code.
     """
     args = make_parser().parse_args(arguments)
-    logging.basicConfig(level=logging.WARNING, format='splatam: %(levelname)s: %(message)s')
+    handler = logging.StreamHandler()
+    handler.addFilter(_Once())
+    logging.basicConfig(level=logging.WARNING, format='splatam: %(levelname)s: %(message)s', handlers=[handler])
     try:
         return args.run(args)
     except SplatamError as error:
@@ -43,6 +45,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print('splatam: interrupted', file=sys.stderr)
         return EXIT_INTERRUPTED
+
+
+class _Once:
+    """Lets each warning pass once: a recording is opened several times by some commands."""
+
+    def __init__(self) -> None:
+        self._said: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Returns False for a message that was said already."""
+        text = record.getMessage()
+        is_new = text not in self._said
+        self._said.add(text)
+        return is_new
 
 
 def make_parser() -> argparse.ArgumentParser:

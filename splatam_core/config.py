@@ -15,10 +15,11 @@ from typing import Any
 
 import yaml
 
-from splatam_core.errors import ConfigError, one_line
+from splatam_core.errors import ConfigError
 from splatam_core.resources import config_dir
 from splatam_core.retired_settings import migrated, tombstone
 from splatam_core.settings import Setting, Value, flatten, leaf, setting, settings_of, unflatten, with_leaf
+from splatam_core.text_files import parse_yaml, read_yaml
 
 MAX_STEPS, MAX_SAMPLES, MAX_FRAMES = 100_000, 1_000_000, 10**9
 MAX_PX = 65_536
@@ -414,6 +415,8 @@ def check_effect(before: SlamConfig, after: SlamConfig) -> None:
 
 
 def _check_combinations(config: SlamConfig) -> None:
+    if 0 < config.width < 16:
+        raise ConfigError(f'width = {config.width}: expected 0 (as recorded) or at least 16 (px)')
     if not config.depth.min_m < config.depth.max_m:
         raise ConfigError(f'depth.min_m = {config.depth.min_m:g}: expected less than depth.max_m = {config.depth.max_m:g}')
     if config.device == 'cuda' and config.rasterizer == 'cpu':
@@ -444,12 +447,9 @@ def to_yaml(config: SlamConfig) -> str:
 
 def _read_preset(preset: str) -> dict[str, Any]:
     path = Path(preset) if preset.endswith(('.yaml', '.yml')) else config_dir() / 'presets' / f'{preset}.yaml'
-    if not path.is_file():
+    if not os.path.isfile(path):  # False for impossible names, too
         raise ConfigError(f"unknown preset '{preset}'; shipped: {', '.join(preset_names())}; or give a .yaml file")
-    try:
-        values = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f'{path}: cannot be read: {one_line(error)}') from None
+    values = read_yaml(path, ConfigError)
     if not isinstance(values, (dict, type(None))):
         raise ConfigError(f'{path}: expected a mapping of settings')
     return values or {}
@@ -460,8 +460,8 @@ def _parse_override(text: str) -> tuple[str, object]:
     if not equals:
         raise ConfigError(f"'{text}': expected key=value, for example tracking.iterations=40")
     try:
-        return name.strip(), _number(yaml.safe_load(value))
-    except yaml.YAMLError:
+        return name.strip(), _number(parse_yaml(value))
+    except ValueError:
         raise ConfigError(f"'{text}': the value is not valid YAML") from None
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatam_core.commands.shared import (
     BAG_SUFFIXES,
+    EXIT_ERROR,
     Command,
     add_run_argument,
     open_run,
@@ -16,6 +18,7 @@ from splatam_core.commands.shared import (
     positive,
     progress,
     say,
+    usable_ground_truth,
 )
 from splatam_core.errors import DatasetError, RunFolderError, SplatamError
 
@@ -45,13 +48,17 @@ def evaluate(args: argparse.Namespace) -> int:
     from splatam_core.runs.layout import MAP
 
     run = open_run(args.dir, args.device)
-    truth, sequence = _truth_and_frames(run, args.truth)
+    truth, sequence, fault = _truth_and_frames(run, args.truth)
     if sequence is not None and not (run.path / MAP).is_file():
         say(f'{run.path} has no {MAP} because the run ended before saving it: only the trajectory is scored')
         sequence = None
     novel = _score_novel_views(run, args.novel_views) if args.novel_views else None
-    print_summary(score(run, truth, sequence, args.every, novel), args.dir)
-    return 0
+    if args.truth is None and sequence is not None:
+        metrics = score_own_run(run, truth, sequence, args.every, novel)
+    else:
+        metrics = score(run, truth, sequence, args.every, novel)
+    print_summary(metrics, args.dir)
+    return 0 if fault is None else EXIT_ERROR
 
 
 def score(
@@ -84,33 +91,51 @@ def score(
     return evaluation.metrics
 
 
-def score_own_run(run: RunRecord, sequence: Sequence, every: int = 1) -> Metrics:
+def score_own_run(
+    run: RunRecord, truth: Trajectory | None, sequence: Sequence, every: int = 1, novel: NovelViews | None = None
+) -> Metrics:
     """Scores a run against its own source; the images only where too few frames are tracked for a trajectory error."""
+    from splatam_core.evaluation.score import score_trajectory
+
     try:
-        return score(run, sequence.ground_truth(), sequence, every)
+        if truth is not None:
+            score_trajectory(run, truth)
     except RunFolderError as error:
         say(f'no trajectory error: {error}')
-        return score(run, None, sequence, every)
+        truth = None
+    return score(run, truth, sequence, every, novel)
 
 
-def _truth_and_frames(run: RunRecord, given: str | None) -> tuple[Trajectory | None, Sequence | None]:
-    """Returns the ground truth and the frames to score against. The frames are those of the run's own source if possible."""
-    from splatam_core.geometry.trajectory import read_trajectory
+def _truth_and_frames(run: RunRecord, given: str | None) -> tuple[Trajectory | None, Sequence | None, SplatamError | None]:
+    """Returns the ground truth, the frames to score against, and the fault for which a given ground truth cannot be used.
+
+    The frames are those of the run's own source if possible.
+
+    Raises:
+        SplatamError: there is nothing to score against.
+    """
+    from splatam_core.geometry.trajectory import read_ground_truth
     from splatam_core.runs.record import Source
 
     if given is None:
         if run.description.source is None:
             raise RunFolderError(f'{run.path} does not say where its frames came from: pass --truth FILE|BAG|DATASET')
         sequence = open_source(run.description.source)
-        return sequence.ground_truth(), sequence
-    own = _open_own_source(run)
-    if Path(given).is_file() and Path(given).suffix not in BAG_SUFFIXES:
-        return read_trajectory(Path(given)), own
-    other = open_source(Source(given, width=run.camera.width if run.camera else None))
-    truth = other.ground_truth()
+        return usable_ground_truth(sequence), sequence, None
+    frames = _open_own_source(run)
+    is_bag_or_dataset = not os.path.isfile(given) or Path(given).suffix in BAG_SUFFIXES
+    other = open_source(Source(given, width=run.camera.width if run.camera else None)) if is_bag_or_dataset else None
+    frames = frames if frames is not None else other
+    try:
+        truth = read_ground_truth(Path(given)) if other is None else other.ground_truth()
+    except SplatamError as error:
+        if frames is None:
+            raise
+        say(f'the ground truth is not used: {error}')
+        return None, frames, error
     if truth is None:
         say(f'{given} has no ground-truth poses: only the images are scored')
-    return truth, other if own is None else own
+    return truth, frames, None
 
 
 def _open_own_source(run: RunRecord) -> Sequence | None:
@@ -140,11 +165,12 @@ def _score_novel_views(run: RunRecord, alignment: str) -> NovelViews:
     return score_novel_views(run, truth, test, alignment, progress('novel views', 'view'))
 
 
-def print_summary(metrics: Metrics, folder: Path) -> None:
-    """Prints the main numbers, one per line."""
+def print_summary(metrics: Metrics, folder: Path, left_out: int = 0) -> None:
+    """Prints the main numbers, one per line. left_out: number of frames that could not be used."""
     m, notes = metrics, metrics.notes
     rows = [
         ('tracked', f'{m.tracked} of {m.frames} frames'),
+        *([('left out', f'{left_out} of {m.frames + left_out} frames, which could not be used; see above')] if left_out else []),
         ('speed', _text(m.fps, 1, '.2f', 'fps, decoding excluded')),
         ('ATE RMSE', _text(m.ate_rmse_m, 100, '.2f', 'cm')),
         ('RPE', _relative(m)),

@@ -6,7 +6,15 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatam_core.commands.shared import Command, add_run_argument, open_run, open_source, positive, progress
+from splatam_core.commands.shared import (
+    Command,
+    add_run_argument,
+    open_run,
+    open_source,
+    positive,
+    progress,
+    usable_ground_truth,
+)
 from splatam_core.errors import ExportError
 
 if TYPE_CHECKING:
@@ -119,7 +127,7 @@ def _true_poses(run: RunRecord) -> NDArray[np.float64]:
     from splatam_core.geometry.trajectory import interpolate_poses
 
     source = run.description.source
-    truth = None if source is None else open_source(source).ground_truth()
+    truth = None if source is None else usable_ground_truth(open_source(source))
     if truth is None:
         return np.full((len(run.trajectory), 4, 4), np.nan)
     poses, known = interpolate_poses(truth, run.trajectory.stamps_ns)

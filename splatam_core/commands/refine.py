@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from splatam_core.commands.evaluate import print_summary, score_own_run
-from splatam_core.commands.shared import Command, add_run_argument, open_run, open_source, positive, progress
+from splatam_core.commands.shared import Command, add_run_argument, open_run, open_source, positive, progress, usable_ground_truth
 from splatam_core.errors import RunFolderError
 
 
@@ -40,13 +40,14 @@ def refine(args: argparse.Namespace) -> int:
         raise RunFolderError(f"{args.dir}: its frames came from live topics; only runs of 'splatam run' can be refined")
     check_is_free(args.out)
     sequence = open_source(run.description.source)
+    truth = usable_ground_truth(sequence)
     before = mean_scores(score_images(run, sequence, args.every, progress('scoring')).frames)
     refined = refine_map(
         gaussians, sequence, run.mapped_poses(), rasterizer, run.config,
         iterations=args.iterations, progress=progress('refining', 'step'), densify=args.densify,
     )  # fmt: skip
     write_refined(run, args.out, refined, args.iterations, args.densify)
-    metrics = score_own_run(open_run(args.out, args.device), sequence, args.every)
+    metrics = score_own_run(open_run(args.out, args.device), truth, sequence, args.every)
     print_summary(metrics, args.out)
     if before.psnr_db is not None and metrics.psnr_db is not None:
         print(f'PSNR was {before.psnr_db:.2f} dB, is {metrics.psnr_db:.2f} dB')

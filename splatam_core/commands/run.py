@@ -22,12 +22,14 @@ from splatam_core.commands.shared import (
     positive,
     say,
     source_of,
+    usable_ground_truth,
 )
 from splatam_core.errors import DatasetError, FrameError, RunFolderError, SplatamError
 
 if TYPE_CHECKING:
     from splatam_core.config import SlamConfig
     from splatam_core.datasets.base import Sequence as FrameSequence
+    from splatam_core.geometry.trajectory import Trajectory
     from splatam_core.runs.metrics import Metrics
     from splatam_core.runs.resume import CheckpointWriter
     from splatam_core.runs.writer import RunFolder
@@ -74,8 +76,8 @@ def run(args: argparse.Namespace) -> int:
     if metrics.frames == 0:
         raise RunFolderError(f'{job.sequence.name}: none of its {len(job.sequence)} frames could be used; see above')
     if not args.no_evaluate:
-        metrics = score_own_run(read_run(path), job.sequence)
-    print_summary(metrics, path)
+        metrics = score_own_run(read_run(path), job.ground_truth, job.sequence)
+    print_summary(metrics, path, left_out=len(job.sequence) - metrics.frames)
     return 0
 
 
@@ -89,6 +91,7 @@ class _Job:
         slam: its state before that frame.
         folder: holds the frames before that frame.
         checkpoints: saves checkpoints.
+        ground_truth: the true poses, to score the run; None if they are unknown.
     """
 
     sequence: FrameSequence
@@ -96,6 +99,7 @@ class _Job:
     slam: Slam
     folder: RunFolder
     checkpoints: CheckpointWriter
+    ground_truth: Trajectory | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,11 +129,12 @@ def _begin(args: argparse.Namespace) -> _Job:
     apply_threads(config)
     source = at_width(source_of(args), config)
     sequence, slam = prepare(open_source(source), config)
+    truth = _checked_ground_truth(sequence, args)
     _say_backend(slam)
     every, keep = args.checkpoint_every, args.keep_checkpoints or KEEP_CHECKPOINTS
     description = RunDescription('splatam run', args.preset, source, every, keep)
     folder = RunFolder.create(args.out, config, description, overwrite=args.overwrite)
-    return _Job(sequence, 0, slam, folder, CheckpointWriter(folder, len(sequence), every, keep, say))
+    return _Job(sequence, 0, slam, folder, CheckpointWriter(folder, len(sequence), every, keep, say), truth)
 
 
 def _config(args: argparse.Namespace) -> SlamConfig:
@@ -151,7 +156,12 @@ def _resume(args: argparse.Namespace) -> _Job:
     keep = args.keep_checkpoints or description.keep_checkpoints
     say(f'continuing {args.resume} at frame {run.first} of {len(run.sequence)}')
     writer = CheckpointWriter(run.folder, len(run.sequence), every, keep, say)
-    return _Job(run.sequence, run.first, run.slam, run.folder, writer)
+    return _Job(run.sequence, run.first, run.slam, run.folder, writer, _checked_ground_truth(run.sequence, args))
+
+
+def _checked_ground_truth(sequence: FrameSequence, args: argparse.Namespace) -> Trajectory | None:
+    """Returns the true poses, read before the run begins, so that a fault in them is said before it and costs no time."""
+    return None if args.no_evaluate else usable_ground_truth(sequence)
 
 
 def _say_backend(slam: Slam) -> None:

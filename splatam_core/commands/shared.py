@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
@@ -11,10 +12,12 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 from splatam_core.config import DEVICES, computed_on
+from splatam_core.errors import SplatamError
 
 if TYPE_CHECKING:
     from splatam_core.config import SlamConfig
     from splatam_core.datasets.base import Sequence
+    from splatam_core.geometry.trajectory import Trajectory
     from splatam_core.runs.record import RunRecord, Source
 
 BAG_SUFFIXES = ('.db3', '.mcap', '.bag')
@@ -85,7 +88,7 @@ def source_of(args: argparse.Namespace) -> Source:
     """Returns the recording that the arguments name."""
     from splatam_core.runs.record import Source
 
-    path = str(Path(args.source).resolve()) if Path(args.source).exists() else args.source
+    path = str(Path(args.source).resolve()) if os.path.exists(args.source) else args.source  # False for impossible names, too
     return Source(
         path=path,
         format=args.format,
@@ -150,6 +153,15 @@ def open_source(source: Source) -> Sequence:
         split=source.split,
         skip_bad=source.skip_bad,
     )
+
+
+def usable_ground_truth(sequence: Sequence) -> Trajectory | None:
+    """Returns the true poses of a recording; None if it has none. A fault in them is said, and costs nothing but them."""
+    try:
+        return sequence.ground_truth()
+    except SplatamError as error:
+        say(f'the ground truth is not used: {error}')
+        return None
 
 
 def open_run(path: Path, device: str | None = None) -> RunRecord:

@@ -111,6 +111,7 @@ class Format:
         name: value of ``--format``.
         expects: what a source of this format holds, for the error message about an unknown source.
         recognises: returns True if a SOURCE looks like this format; examines names only.
+        accepts: returns True if a SOURCE can be read as this format when the user names it; None = as ``recognises``.
         open: opens the whole recording; the caller cuts out the window of ``ReadOptions``.
         is_path: True if a source is a file or folder.
         has_topics: True if topics can be chosen.
@@ -128,6 +129,11 @@ class Format:
     has_splits: bool = False
     flags_bad: bool = False
     is_last_resort: bool = False
+    accepts: Callable[[str], bool] | None = None
+
+    def fits(self, source: str) -> bool:
+        """Returns True if the user may read a SOURCE as this format."""
+        return (self.accepts or self.recognises)(source)
 
 
 class Window:

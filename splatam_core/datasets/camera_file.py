@@ -16,20 +16,24 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from splatam_core.errors import CameraError, one_line
+from splatam_core.datasets.files import whole
+from splatam_core.errors import CameraError
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
+from splatam_core.text_files import read_yaml
 
 NAME = 'camera.yaml'
 REQUIRED = frozenset({'width', 'height', 'fx', 'fy', 'cx', 'cy'})
 OPTIONAL = frozenset({'distortion_model', 'distortion', 'depth_scale', 'pose_axes'})
 POSE_AXES = ('opencv', 'opengl')
+DEPTH_SCALES = (1e-3, 1e9)
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,10 +104,7 @@ def read_camera_file(path: Path) -> CameraFile:
     Raises:
         CameraError: the file holds no such mapping, or a key is missing, unknown or not a number.
     """
-    try:
-        values = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise CameraError(f'{path}: cannot be read: {one_line(error)}') from None
+    values = read_yaml(path, CameraError)
     if not isinstance(values, dict):
         raise CameraError(f'{path}: expected a mapping with width, height, fx, fy, cx, cy')
     if missing := REQUIRED - values.keys():
@@ -112,20 +113,39 @@ def read_camera_file(path: Path) -> CameraFile:
         raise CameraError(f'{path}: unknown {", ".join(sorted(map(str, unknown)))}')
     try:
         return _parse(values)
-    except (TypeError, ValueError, CameraError) as error:
+    except (TypeError, ValueError, OverflowError, CameraError) as error:
         raise CameraError(f'{path}: {error}') from None
 
 
+def say_assumed(folder: Path, what: str) -> None:
+    """Say that a folder states no camera, and which one is assumed."""
+    _log.warning('%s: states no camera; %s is assumed; state it in a %s if it is another', folder, what, NAME)
+
+
+def checked_depth_scale(value: Any) -> float:
+    """Returns counts per metre.
+
+    Raises:
+        CameraError: the number is not positive, or impossible for depth.
+        TypeError, ValueError, OverflowError: the value is no number.
+    """
+    scale = float(value)
+    if not scale > 0:
+        raise CameraError(f'depth_scale {value} must be positive (counts per metre)')
+    least, most = DEPTH_SCALES
+    if not least <= scale <= most:
+        raise CameraError(f'depth_scale {value} must be {least:g} to {most:g} counts per metre')
+    return scale
+
+
 def _parse(values: dict[str, Any]) -> CameraFile:
-    width, height = int(values['width']), int(values['height'])
+    width, height = whole(values, 'width'), whole(values, 'height')
     fx, fy, cx, cy = (float(values[key]) for key in ('fx', 'fy', 'cx', 'cy'))
     pinhole = PinholeCamera(width, height, fx, fy, cx, cy)
     distortion = tuple(float(value) for value in values.get('distortion') or ())
     scale = values.get('depth_scale')
-    if scale is not None and not float(scale) > 0:
-        raise CameraError(f'depth_scale {scale} must be positive (counts per metre)')
     axes = values.get('pose_axes')
     if axes not in (None, *POSE_AXES):
         raise CameraError(f"pose_axes '{axes}' is not one of {', '.join(POSE_AXES)}")
     model = values.get('distortion_model') or 'none'
-    return CameraFile(CameraCalibration(pinhole, model, distortion), None if scale is None else float(scale), axes)
+    return CameraFile(CameraCalibration(pinhole, model, distortion), None if scale is None else checked_depth_scale(scale), axes)

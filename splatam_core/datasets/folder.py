@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +57,7 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     """List the frames of a folder.
 
     Raises:
-        DatasetError: there are no frames, one lacks its depth, or the camera is not stated.
+        DatasetError: there are no frames, too many lack their depth, or the camera is not stated.
         CameraError: the camera cannot be used.
     """
     color = _by_number(folder / (_present(folder, COLOR_FOLDERS) or COLOR_FOLDERS[0]), ('.jpg', '.jpeg', '.png'))
@@ -67,7 +68,7 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
         {position: depth[number] for position, number in enumerate(numbers) if number in depth},
         folder, 'rgb/000000.jpg with depth/000000.png',
     )  # fmt: skip
-    camera = _camera(folder, pairs[0].color)
+    camera = _camera(folder, (pair.color for pair in pairs))
 
     def ground_truth() -> Trajectory | None:
         poses = _poses(folder, numbers)
@@ -110,27 +111,43 @@ def _by_number(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
 # --- camera ---
 
 
-def _camera(folder: Path, color: Path) -> CameraFile:
-    stated = find_camera_file(folder, may_state_axes=True)
-    if stated is not None:
-        return stated
-    name = _present(folder, JSON_FILES + MATRIX_FILES)
-    if name is None:
+def _camera(folder: Path, color: Iterable[Path]) -> CameraFile:
+    stated = find_camera_file(folder, may_state_axes=True) or find_intrinsics(folder, color)
+    if stated is None:
         raise DatasetError(
             f'{folder}: the camera is not stated; put a camera.yaml with width, height, fx, fy, cx, cy and depth_scale '
             f'into the folder (or one of {", ".join(JSON_FILES + MATRIX_FILES)})'
         )
+    return stated
+
+
+def find_intrinsics(folder: Path, color: Iterable[Path]) -> CameraFile | None:
+    """Returns the camera of Open3D's ``intrinsic.json`` or of a matrix in a text file; None without such a file.
+
+    Args:
+        folder: may hold one such file.
+        color: the colour images, whose size a matrix does not state.
+
+    Raises:
+        DatasetError: several exist, or it cannot be read.
+        CameraError: the camera cannot be used.
+    """
+    name = _present(folder, JSON_FILES + MATRIX_FILES)
+    if name is None:
+        return None
     path = folder / name
     if name in JSON_FILES:
-        return CameraFile(_open3d_calibration(path), DEPTH_SCALE)
-    return CameraFile(files.calibration_from_matrix(files.read_matrix(path, 3, 4), files.image_size(color)), DEPTH_SCALE)
+        return CameraFile(_open3d_calibration(path), None)
+    return CameraFile(files.calibration_from_matrix(files.read_matrix(path, 3, 4), files.first_size(color)), None)
 
 
 def _open3d_calibration(path: Path) -> CameraCalibration:
     values = files.read_json(path)
     with files.parsing(path):
         K = np.array(values['intrinsic_matrix'], np.float64).reshape(3, 3).T
-        pinhole = PinholeCamera(int(values['width']), int(values['height']), K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+        pinhole = PinholeCamera(
+            files.whole(values, 'width'), files.whole(values, 'height'), *(float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        )
     return CameraCalibration(pinhole)
 
 
@@ -145,7 +162,7 @@ def _poses(folder: Path, numbers: list[int]) -> Poses | None:
     path = folder / name
     if name in POSE_FOLDERS:
         posed = _by_number(path, ('.txt', '.npy'))
-        return [files.read_pose(posed[number]) if number in posed else None for number in numbers]
+        return files.read_poses([posed.get(number) for number in numbers], path)
     poses = _read_log(path) if name == LOG_FILE else files.read_pose_rows(path)
     if len(poses) != len(numbers):
         raise DatasetError(f'{path}: has {len(poses)} poses for {len(numbers)} frames; each frame needs one, in order')
@@ -157,7 +174,8 @@ def _read_log(path: Path) -> Poses:
     numbers = files.read_numbers(path)
     if numbers.size % 19:
         raise DatasetError(f'{path}: expected blocks of 3 + 16 numbers, got {numbers.size} numbers')
-    return [files.pose(block[3:], f'{path}, pose {index}') for index, block in enumerate(numbers.reshape(-1, 19))]
+    blocks = enumerate(numbers.reshape(-1, 19)[:, 3:])
+    return files.tolerated([partial(files.pose, block, f'{path}, pose {index}') for index, block in blocks], path)
 
 
 def _recognises(source: str) -> bool:

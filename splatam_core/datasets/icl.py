@@ -3,11 +3,14 @@
 ::
 
     living_room_traj2_frei_png/
-        associations.txt            # this or the next file
-        livingRoom2.gt.freiburg     # frame tx ty tz qx qy qz qw, camera to world, y up; optional
+        livingRoom2.gt.freiburg     # frame tx ty tz qx qy qz qw, camera to world, y up
+        associations.txt            # optional
         rgb/0.png
         depth/0.png                 # 16 bit, 5000 counts per metre, along the axis; 0 = no reading
         camera.yaml                 # optional: else 640x480, f 481.2 480, c 319.5 239.5
+
+A folder without ``.gt.freiburg`` is taken for ICL-NUIM only if its name says so (``living_room_traj2``, ``office_traj0``,
+``icl``), or with ``--format icl``.
 
 Layout: doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html. The poses have POV-Ray's left-handed world and camera axes, y up, while
 image rows run downwards. The reader mirrors them, T' = F T F with F = diag(1, -1, 1, 1), and takes fy = +480 (-480
@@ -18,18 +21,19 @@ Ground truth is assigned by the frame numbers in its file: frame 0, and in the o
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core.datasets import base, files
-from splatam_core.datasets.camera_file import camera_of
+from splatam_core.datasets.camera_file import camera_of, say_assumed
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
 from splatam_core.errors import DatasetError
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
-from splatam_core.geometry.trajectory import Trajectory
+from splatam_core.geometry.trajectory import Trajectory, is_pose
 
 CAMERA = CameraCalibration(PinholeCamera(640, 480, 481.2, 480.0, 319.5, 239.5))
 DEPTH_SCALE = 5000.0
@@ -40,12 +44,12 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     """List the frames of a folder.
 
     Raises:
-        DatasetError: there are no frames, or one lacks its depth.
+        DatasetError: there are no frames, or too many lack their depth.
         CameraError: ``camera.yaml`` cannot be used.
     """
     color = files.numbered(folder / 'rgb', r'(\d+)\.png')
     pairs = pair_up(color, files.numbered(folder / 'depth', r'(\d+)\.png'), folder, 'rgb/0.png with depth/0.png')
-    camera = camera_of(folder, lambda: CAMERA, DEPTH_SCALE)
+    camera = camera_of(folder, lambda: _assumed(folder), DEPTH_SCALE)
 
     def ground_truth() -> Trajectory | None:
         poses = _poses(folder)
@@ -64,23 +68,40 @@ def _poses(folder: Path) -> dict[int, NDArray[np.float64]]:
     if not paths:
         return {}
     numbers = files.read_numbers(paths[0])
-    if numbers.size % 8 or not np.isfinite(numbers).all():
+    if numbers.size % 8:
         raise DatasetError(f"{paths[0]}: expected 'frame tx ty tz qx qy qz qw' in each line, got {numbers.size} numbers")
     rows = numbers.reshape(-1, 8)
-    if not np.linalg.norm(rows[:, 4:], axis=1).all():
-        raise DatasetError(f'{paths[0]}: a quaternion is zero')
+    is_known = np.array([is_pose(row[1:4].tolist(), row[4:].tolist()) and abs(row[0]) < 2**53 for row in rows], bool)
+    if len(rows) and not is_known.any():
+        raise DatasetError(f'{paths[0]}: none of its {len(rows)} poses is known: each holds NaN, infinity or no rotation')
+    rows = rows[is_known]
     T = MIRROR @ se3.compose(rows[:, [7, 4, 5, 6]], rows[:, 1:4]) @ MIRROR
     return dict(zip(rows[:, 0].astype(int).tolist(), T, strict=True))
 
 
+def _assumed(folder: Path) -> CameraCalibration:
+    say_assumed(folder, 'the camera of ICL-NUIM (f 481.2 480, c 319.5 239.5, 640x480)')
+    return CAMERA
+
+
+def says_icl(folder: Path) -> bool:
+    """Returns True if a folder says that it is a recording of ICL-NUIM, by a file or by its name."""
+    named = re.search(r'(living.?room|office).*traj\d|traj\d_frei|(?<![a-z])icl(?![a-z])', folder.resolve().name.lower())
+    return named is not None or any(folder.glob('*.gt.freiburg'))
+
+
 def _recognises(source: str) -> bool:
+    return _accepts(source) and says_icl(Path(source))
+
+
+def _accepts(source: str) -> bool:
     folder = Path(source)
-    stated = (folder / 'associations.txt').is_file() or any(folder.glob('*.gt.freiburg'))
-    return stated and (folder / 'rgb').is_dir() and (folder / 'depth').is_dir() and not (folder / 'rgb.txt').exists()
+    has_images = (folder / 'rgb').is_dir() and (folder / 'depth').is_dir()
+    return has_images and not (folder / 'rgb.txt').exists()
 
 
 def _open(source: str, options: base.ReadOptions) -> ImagePairs:
     return read(Path(source), width=options.width)
 
 
-FORMAT = base.Format('icl', 'a folder with rgb/, depth/, and associations.txt or a .gt.freiburg file', _recognises, _open)
+FORMAT = base.Format('icl', 'a folder with rgb/, depth/ and a .gt.freiburg file', _recognises, _open, accepts=_accepts)

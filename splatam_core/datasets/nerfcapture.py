@@ -9,6 +9,9 @@
         depth/0.png             # 16 bit, integer_depth_scale metres a count (10/65535), 0 = no reading
         camera.yaml             # optional; overrides the cameras in transforms.json
 
+The app's own offline recordings have ``images/0.png`` with ``images/0.depth.png``. The paths in ``transforms.json`` are
+followed, whatever they are; a missing suffix is ``.png``, ``.jpg`` or ``.jpeg``.
+
 Layout: ``scripts/nerfcapture2dataset.py`` (github.com/spla-tam/SplaTAM) and instant-ngp's ``nerfcapture2nerf.py``.
 Poses are ARKit's, with OpenGL's camera axes. The intrinsics differ between frames because the lens focuses; all frames
 are rectified to the first frame's camera. Frames without depth are skipped. There are no stamps: frames come at 30 Hz,
@@ -22,11 +25,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from splatam_core.datasets import base, files, nerfstudio
-from splatam_core.datasets.camera_file import camera_of
+from splatam_core.datasets.camera_file import camera_of, checked_depth_scale
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
 from splatam_core.errors import DatasetError
 from splatam_core.geometry.camera import CameraCalibration
@@ -44,7 +44,7 @@ class _Capture:
     color: dict[int, Path]
     depth: dict[int, Path]
     calibrations: dict[int, CameraCalibration]
-    poses: list[NDArray[np.float64] | None]
+    frames: list[dict[str, Any]]
     depth_scale: float
 
 
@@ -64,7 +64,7 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     camera = camera_of(folder, lambda: capture.calibration, capture.depth_scale)
     return ImagePairs(
         folder.resolve().name, pairs, camera.calibration, DepthFormat(camera.depth_scale),
-        width=width, ground_truth=lambda: trajectory(pairs, capture.poses),
+        width=width, ground_truth=lambda: trajectory(pairs, nerfstudio.poses(capture.frames, folder / 'transforms.json')),
     )  # fmt: skip
 
 
@@ -80,27 +80,22 @@ def _read_transforms(folder: Path) -> _Capture:
         cameras = [nerfstudio.calibration({**values, **frame}) for frame in frames]
         return _Capture(
             calibration=cameras[0],
-            color={index: _image(folder, frame['file_path']) for index, frame in enumerate(frames)},
-            depth={index: _image(folder, frame['depth_path']) for index, frame in enumerate(frames)},
+            color={index: files.listed(folder, str(frame['file_path'])) for index, frame in enumerate(frames)},
+            depth={index: files.listed(folder, str(frame['depth_path'])) for index, frame in enumerate(frames)},
             calibrations=dict(enumerate(cameras)),
-            poses=[nerfstudio.pose(frame, f'{path}, frame {index}') for index, frame in enumerate(frames)],
-            depth_scale=1 / float(values.get('integer_depth_scale', METRES_PER_COUNT)),
+            frames=frames,
+            depth_scale=checked_depth_scale(1 / float(values.get('integer_depth_scale', METRES_PER_COUNT))),
         )
 
 
-def _image(folder: Path, name: Any) -> Path:
-    """Returns the file that a path in the list refers to; NeRFCapture's own lists omit the suffix."""
-    path = folder / str(name)
-    return path if path.suffix else path.with_suffix('.png')
-
-
 def _recognises(source: str) -> bool:
-    folder = Path(source)
-    return (folder / 'transforms.json').is_file() and (folder / 'depth').is_dir()
+    return (Path(source) / 'transforms.json').is_file()
 
 
 def _open(source: str, options: base.ReadOptions) -> ImagePairs:
     return read(Path(source), width=options.width)
 
 
-FORMAT = base.Format('nerfcapture', 'a folder with transforms.json, rgb/ and depth/', _recognises, _open)
+FORMAT = base.Format(
+    'nerfcapture', 'a folder with transforms.json, whose frames have a file_path and a depth_path', _recognises, _open
+)

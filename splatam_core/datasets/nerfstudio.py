@@ -6,11 +6,12 @@ are OpenCV's coefficients, with camera model ``OPENCV_FISHEYE`` ``k1 k2 k3 k4`` 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatam_core.datasets import files
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
@@ -25,7 +26,7 @@ def calibration(values: Mapping[str, Any]) -> CameraCalibration:
         KeyError, TypeError, ValueError: a value is missing or unsuitable; ``files.parsing`` turns this into an error message.
         CameraError: the camera cannot be used.
     """
-    width, height = int(values['w']), int(values['h'])
+    width, height = files.whole(values, 'w'), files.whole(values, 'h')
     fx, fy, cx, cy = (float(values[key]) for key in INTRINSICS)
     pinhole = PinholeCamera(width, height, fx, fy, cx, cy)
     is_fisheye = values.get('camera_model') == 'OPENCV_FISHEYE'
@@ -36,12 +37,16 @@ def calibration(values: Mapping[str, Any]) -> CameraCalibration:
     return CameraCalibration(pinhole, 'equidistant' if is_fisheye else 'plumb_bob', distortion)
 
 
-def pose(frame: Mapping[str, Any], where: str) -> NDArray[np.float64] | None:
-    """Returns a frame's pose with OpenCV's camera axes, [4, 4]; None if the frame has none.
+def poses(frames: Sequence[Mapping[str, Any]], path: Path) -> list[files.Pose | None]:
+    """Returns each frame's pose with OpenCV's camera axes, [4, 4]; None if the frame has none.
 
     Raises:
-        DatasetError: the matrix is no pose.
+        DatasetError: too many of the matrices are no poses.
     """
-    if 'transform_matrix' not in frame:
-        return None
-    return files.from_opengl(files.pose(np.array(frame['transform_matrix'], np.float64), where))
+
+    def read(index: int, frame: Mapping[str, Any]) -> files.Pose | None:
+        with files.parsing(path):
+            matrix = np.array(frame['transform_matrix'], np.float64) if 'transform_matrix' in frame else None
+        return None if matrix is None else files.from_opengl(files.pose(matrix, f'{path}, frame {index}'))
+
+    return files.tolerated([partial(read, *frame) for frame in enumerate(frames)], path)

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import logging
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core.datasets import base, files
-from splatam_core.errors import DatasetError
+from splatam_core.errors import DatasetError, FrameError
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
-from splatam_core.geometry.trajectory import Trajectory
+from splatam_core.geometry.stamps import LIMIT_NS
+from splatam_core.geometry.trajectory import Trajectory, too_many
 from splatam_core.images.rectification import FrameFactory
 from splatam_core.types import RgbdFrame
+
+SAMPLE = 100
+"""How many frames are examined when a recording is opened."""
+
+SHOWN = 3
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,13 +35,13 @@ class ImagePair:
     Attributes:
         stamp_ns: time of the exposure.
         color: image file.
-        depth: image file, registered to colour.
+        depth: image file, registered to colour; None if it is missing.
         calibration: the frame's own camera; None if all frames have the same.
     """
 
     stamp_ns: int
     color: Path
-    depth: Path
+    depth: Path | None
     calibration: CameraCalibration | None = None
 
 
@@ -93,9 +103,11 @@ class ImagePairs:
             width: width of the frames in pixels; None keeps the recorded size.
 
         Raises:
-            DatasetError: stamps do not increase, or the first readable image does not have the camera's size.
+            DatasetError: stamps do not increase, the first readable image does not have the camera's size, or more than a
+                tenth of the images are missing or are none.
         """
         base.check_increasing(np.array([pair.stamp_ns for pair in pairs], np.int64), name)
+        _check_files(pairs, name)
         _check_size(pairs, calibration)
         self.name = name
         self.depth_scale = depth.scale
@@ -108,13 +120,27 @@ class ImagePairs:
         return len(self._pairs)
 
     def __getitem__(self, index: int) -> RgbdFrame:
-        """Read one frame."""
+        """Read one frame.
+
+        Raises:
+            FrameError: one of its files is missing or damaged, or does not fit the camera.
+        """
         pair = self._pairs[index]
         factory = self._factory(pair.calibration or self._calibration)
-        return factory.make(pair.stamp_ns, files.read_color(pair.color), self._depth.read(pair.depth))
+        try:
+            if pair.depth is None:
+                raise DatasetError(f'{pair.color}: there is no depth image for it')
+            rgb, depth_m = files.read_color(pair.color), self._depth.read(pair.depth)
+        except DatasetError as error:
+            raise FrameError(str(error)) from None
+        return factory.make(pair.stamp_ns, rgb, depth_m)
 
     def ground_truth(self) -> Trajectory | None:
-        """The true poses; None if the dataset has none."""
+        """The true poses, read once; None if the dataset has none."""
+        return self._known_ground_truth
+
+    @cached_property
+    def _known_ground_truth(self) -> Trajectory | None:
         return self._ground_truth()
 
     def _make_factory(self, calibration: CameraCalibration) -> FrameFactory:
@@ -138,6 +164,55 @@ def _check_size(pairs: Sequence[ImagePair], calibration: CameraCalibration) -> N
         return
 
 
+def _check_files(pairs: Sequence[ImagePair], name: str) -> None:
+    """Check that the files of nearly all frames exist, and that nearly all of a sample of them are images."""
+    names: dict[Path, set[str]] = {}
+    missing = [fault for pair in pairs if (fault := _missing(pair, names))]
+    _refuse_if_too_many(missing, len(pairs), name)
+    sample = pairs[:: max(1, len(pairs) // SAMPLE)]
+    _refuse_if_too_many([fault for pair in sample if (fault := _no_image(pair))], len(sample), name)
+
+
+def _refuse_if_too_many(faults: Sequence[str], examined: int, name: str) -> None:
+    if too_many(len(faults), examined):
+        raise DatasetError(
+            f'{name}: {len(faults)} of {examined} frames cannot be read, and at most a tenth may be missing: {_some(faults, "; ")}'
+        )
+
+
+def _some(names: Sequence[str], between: str) -> str:
+    return between.join(names[:SHOWN]) + (' and so on' if len(names) > SHOWN else '')
+
+
+def _missing(pair: ImagePair, names: dict[Path, set[str]]) -> str:
+    """Returns which file of a frame does not exist; empty if both do. names: the files of each folder, found on the way."""
+    if pair.depth is None:
+        return f'{pair.color}: there is no depth image for it'
+    for path in (pair.color, pair.depth):
+        if path.parent not in names:
+            names[path.parent] = _names_in(path.parent)
+        if path.name not in names[path.parent] and not os.path.isfile(path):
+            return f'{path}: there is no such file'
+    return ''
+
+
+def _names_in(folder: Path) -> set[str]:
+    try:
+        return set(os.listdir(folder))
+    except (OSError, ValueError):
+        return set()
+
+
+def _no_image(pair: ImagePair) -> str:
+    """Returns which file of a frame is no image; empty if both are."""
+    try:
+        for path in filter(None, (pair.color, pair.depth)):
+            files.image_size(path)
+    except DatasetError as error:
+        return str(error)
+    return ''
+
+
 def pair_up(
     color: Mapping[int, Path],
     depth: Mapping[int, Path],
@@ -158,28 +233,32 @@ def pair_up(
         calibrations: cameras of frames that have their own.
 
     Raises:
-        DatasetError: there is no colour image, or one has no depth.
+        DatasetError: there is no colour image, more than a tenth have no depth, or the numbers are too large.
     """
     if not color:
         raise DatasetError(f'{folder}: no frame in it; expected {expected} and so on')
     missing = [path.name for number, path in color.items() if number not in depth]
-    if missing:
+    if too_many(len(missing), len(color)):
         raise DatasetError(
-            f'{folder}: {len(missing)} of {len(color)} colour images have no depth, the first is {missing[0]}; '
-            f'every frame needs both, named like {expected}'
+            f'{folder}: {len(missing)} of {len(color)} colour images have no depth, and at most a tenth may lack it: '
+            f'{_some(missing, ", ")}; every frame needs both, named like {expected}'
         )
     first, own = next(iter(color)), calibrations or {}
+    if base.nominal_stamp_ns(max(color) - first, rate_hz) >= LIMIT_NS:
+        raise DatasetError(f'{folder}: the numbers in the names, {first} to {max(color)}, are too large to count frames')
     return [
-        ImagePair(base.nominal_stamp_ns(number - first, rate_hz), path, depth[number], own.get(number))
+        ImagePair(base.nominal_stamp_ns(number - first, rate_hz), path, depth.get(number), own.get(number))
         for number, path in color.items()
     ]
 
 
 def trajectory(pairs: Sequence[ImagePair], poses: Sequence[NDArray[np.float64] | None]) -> Trajectory | None:
-    """Returns the known poses at the stamps of their frames; None if none is known."""
+    """Returns the known poses at the stamps of their frames; None if none is known. Says how many are unknown."""
     known = [(pair.stamp_ns, T) for pair, T in zip(pairs, poses, strict=True) if T is not None]
     if not known:
         return None
+    if len(known) < len(pairs):
+        _log.warning('%s: %d of %d true poses are unknown', pairs[0].color.parent, len(pairs) - len(known), len(pairs))
     stamps_ns, matrices = zip(*known, strict=True)
     return Trajectory(np.array(stamps_ns, np.int64), np.stack(matrices))
 

@@ -17,11 +17,11 @@ frame's camera. The first frame is at 1 s, and the numbers in the names count at
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatam_core.datasets import base, files
 from splatam_core.datasets.camera_file import camera_of
@@ -29,6 +29,7 @@ from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajec
 from splatam_core.errors import DatasetError
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
+from splatam_core.geometry.trajectory import is_pose
 
 
 def read(folder: Path, *, width: int | None = None) -> ImagePairs:
@@ -43,21 +44,21 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     color = files.numbered(folder / 'rgb', r'(\d+)\.(?:jpg|png)')
     depth = files.numbered(folder / 'depth', r'(\d+)\.exr')
     with files.parsing(path):
-        rate_hz = round(float(metadata.get('fps', base.NOMINAL_RATE_HZ)))
+        rate_hz = _rate_hz(metadata)
         cameras = _cameras(metadata, list(color))
-        poses = [_pose(metadata, number, path) for number in color]
     own = None if (folder / 'camera.yaml').exists() else cameras
     pairs = pair_up(color, depth, folder, 'rgb/0.jpg with depth/0.exr', rate_hz=rate_hz, calibrations=own)
     camera = camera_of(folder, lambda: cameras[next(iter(color))], 1.0)
-    size = files.read_exr(pairs[0].depth).shape
+    files.check_exr(folder)
+    size = files.first_size(pair.depth for pair in pairs)
     return ImagePairs(
-        folder.resolve().name, pairs, camera.calibration, DepthFormat(None, size=(size[1], size[0])),
-        width=width, ground_truth=lambda: trajectory(pairs, poses),
+        folder.resolve().name, pairs, camera.calibration, DepthFormat(None, size=size),
+        width=width, ground_truth=lambda: trajectory(pairs, _poses(metadata, list(color), path)),
     )  # fmt: skip
 
 
 def _cameras(metadata: dict[str, Any], numbers: list[int]) -> dict[int, CameraCalibration]:
-    size = int(metadata['w']), int(metadata['h'])
+    size = files.whole(metadata, 'w'), files.whole(metadata, 'h')
     of_each = metadata.get('perFrameIntrinsicCoeffs')
     if of_each:
         return {number: CameraCalibration(PinholeCamera(*size, *map(float, of_each[number]))) for number in numbers}
@@ -65,15 +66,29 @@ def _cameras(metadata: dict[str, Any], numbers: list[int]) -> dict[int, CameraCa
     return dict.fromkeys(numbers, files.calibration_from_matrix(K, size))
 
 
-def _pose(metadata: dict[str, Any], number: int, path: Path) -> NDArray[np.float64] | None:
-    """Returns a frame's pose; None if the recording has none, as with the selfie camera."""
-    poses = metadata.get('poses')
-    if not poses:
-        return None
-    values = np.array(poses[number], np.float64)
-    if values.shape != (7,) or not np.isfinite(values).all() or not values[:4].any():
-        raise DatasetError(f'{path}: pose {number}: expected qx qy qz qw tx ty tz, got {poses[number]}')
-    return files.from_opengl(se3.compose(values[[3, 0, 1, 2]], values[4:]))
+def _rate_hz(metadata: dict[str, Any]) -> int:
+    rate_hz = round(float(metadata.get('fps', base.NOMINAL_RATE_HZ)))
+    if not 1 <= rate_hz <= 1000:
+        raise ValueError(f'fps {rate_hz} is not between 1 and 1000')
+    return rate_hz
+
+
+def _poses(metadata: dict[str, Any], numbers: list[int], path: Path) -> list[files.Pose | None]:
+    """Returns each frame's pose; None if the recording has none, as with the selfie camera, or if it is unknown."""
+    stated = metadata.get('poses')
+    if not stated:
+        return [None] * len(numbers)
+
+    def read(number: int) -> files.Pose | None:
+        with files.parsing(path):
+            values = np.array(stated[number], np.float64)
+        if values.shape != (7,):
+            raise DatasetError(f'{path}: pose {number}: expected qx qy qz qw tx ty tz, got {len(values.reshape(-1))} numbers')
+        if not is_pose(values[4:].tolist(), values[:4].tolist()):
+            return None
+        return files.from_opengl(se3.compose(values[[3, 0, 1, 2]], values[4:]))
+
+    return files.tolerated([partial(read, number) for number in numbers], path)
 
 
 def _recognises(source: str) -> bool:

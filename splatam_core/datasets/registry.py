@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from pathlib import Path
 
@@ -62,10 +63,17 @@ def open_sequence(
         width=width, start=start, max_frames=max_frames, topics=topics or BagTopics(),
         stride=stride, crop=crop, split=split, skip_bad=skip_bad,
     )  # fmt: skip
+    try:
+        return _open(source, format, options)
+    except OSError as error:
+        raise DatasetError(f'{source}: cannot be read: {error.strerror or error}') from None
+
+
+def _open(source: str, format: str | None, options: ReadOptions) -> Sequence:
     reader = _reader(format) if format is not None else _guess(source)
-    if reader.is_path and not Path(source).exists():
+    if reader.is_path and not os.path.exists(source):
         raise DatasetError(f'{source}: there is no such file or folder')
-    if not reader.recognises(source):
+    if not (reader.fits(source) if format is not None else reader.recognises(source)):
         nearby = _nearby(Path(source), [reader])
         raise DatasetError(f'{source}: {_found(Path(source))}; {reader.name} expects {reader.expects}{nearby}')
     _check_options(source, reader, options)
@@ -98,7 +106,7 @@ def _guess(source: str) -> Format:
     if fitting:
         names = ' and '.join(reader.name for reader in fitting)
         raise DatasetError(f'{source}: looks like {names} at once; choose one with --format')
-    if not Path(source).exists():
+    if not os.path.exists(source):
         raise DatasetError(f'{source}: there is no such file or folder')
     if nearby := _nearby(Path(source), readers):
         raise DatasetError(f'{source}: {_found(Path(source))}{nearby}')

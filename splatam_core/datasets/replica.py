@@ -20,7 +20,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatam_core.datasets import base, files
-from splatam_core.datasets.camera_file import DatasetCamera, camera_of
+from splatam_core.datasets.camera_file import DatasetCamera, camera_of, checked_depth_scale, find_camera_file, say_assumed
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, row_trajectory
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 
@@ -31,7 +31,7 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     """List the frames of a folder.
 
     Raises:
-        DatasetError: there are no frames, one lacks its depth, or ``cam_params.json`` cannot be used.
+        DatasetError: there are no frames, too many lack their depth, or ``cam_params.json`` cannot be used.
         CameraError: the camera cannot be used.
     """
     color = files.numbered(folder / 'results', r'frame(\d+)\.(?:jpg|png)')
@@ -51,10 +51,12 @@ def _camera(folder: Path) -> DatasetCamera:
             values = files.read_json(path)
             with files.parsing(path):
                 c = values['camera']
-                width, height = int(c['w']), int(c['h'])
+                width, height = files.whole(c, 'w'), files.whole(c, 'h')
                 fx, fy, cx, cy = (float(c[key]) for key in ('fx', 'fy', 'cx', 'cy'))
                 pinhole = PinholeCamera(width, height, fx, fy, cx, cy)
-                return DatasetCamera(CameraCalibration(pinhole), float(c['scale']))
+                return DatasetCamera(CameraCalibration(pinhole), checked_depth_scale(c['scale']))
+    if find_camera_file(folder) is None:
+        say_assumed(folder, "NICE-SLAM's camera of Replica (f 600, c 599.5 339.5, 1200x680, 6553.5 counts per metre)")
     return CAMERA
 
 

@@ -21,9 +21,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatam_core.datasets import base, files, replica
-from splatam_core.datasets.camera_file import camera_of
+from splatam_core.datasets.camera_file import camera_of, say_assumed
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, row_trajectory
 from splatam_core.errors import DatasetError
+from splatam_core.geometry.camera import CameraCalibration
 
 FOLDERS = {'train': '00', 'test': '01'}
 DEPTH_SCALE = 1000.0
@@ -33,7 +34,7 @@ def read(folder: Path, *, split: str = 'train', width: int | None = None) -> Ima
     """List the frames of a split.
 
     Raises:
-        DatasetError: the split is not there, has no frames, or one lacks its depth.
+        DatasetError: the split is not there, has no frames, or too many lack their depth.
         CameraError: ``camera.yaml`` cannot be used.
     """
     frames = folder / 'imap' / FOLDERS[split]
@@ -42,11 +43,16 @@ def read(folder: Path, *, split: str = 'train', width: int | None = None) -> Ima
     color = files.numbered(frames / 'rgb', r'rgb_(\d+)\.png')
     depth = files.numbered(frames / 'depth', r'depth_(\d+)\.png')
     pairs = pair_up(color, depth, frames, 'rgb/rgb_0.png with depth/depth_0.png')
-    camera = camera_of(folder, lambda: replica.CAMERA.calibration, DEPTH_SCALE)
+    camera = camera_of(folder, lambda: _assumed(folder), DEPTH_SCALE)
     return ImagePairs(
         f'{folder.resolve().name}_{split}', pairs, camera.calibration, DepthFormat(camera.depth_scale),
         width=width, ground_truth=lambda: row_trajectory(frames / 'traj_w_c.txt', pairs, list(color)),
     )  # fmt: skip
+
+
+def _assumed(folder: Path) -> CameraCalibration:
+    say_assumed(folder, "vMAP's camera of Replica (f 600, c 599.5 339.5, 1200x680)")
+    return replica.CAMERA.calibration
 
 
 def _recognises(source: str) -> bool:

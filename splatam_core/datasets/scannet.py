@@ -22,6 +22,7 @@ not exported: the first frame is at 1 s, and the numbers in the names count at 3
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,7 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     """List the frames of a folder.
 
     Raises:
-        DatasetError: there are no frames, one lacks its depth, or the intrinsics cannot be read.
+        DatasetError: there are no frames, too many lack their depth, or the intrinsics cannot be read.
         CameraError: the camera cannot be used.
     """
     frames = _frames(folder)
@@ -51,16 +52,16 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     path = frames / 'intrinsic' / 'intrinsic_color.txt'
     camera = camera_of(
         folder,
-        lambda: files.calibration_from_matrix(files.read_matrix(path, 4, 3), files.image_size(pairs[0].color)),
+        lambda: files.calibration_from_matrix(files.read_matrix(path, 4, 3), files.first_size(pair.color for pair in pairs)),
         DEPTH_SCALE,
     )
     _warn_of_extrinsics(frames / 'intrinsic')
 
     def ground_truth() -> Trajectory | None:
         posed = files.numbered(frames / 'pose', r'(\d+)\.txt')
-        return trajectory(pairs, [files.read_pose(posed[number]) if number in posed else None for number in color])
+        return trajectory(pairs, files.read_poses([posed.get(number) for number in color], frames))
 
-    depth_camera = _depth_camera(frames, camera.calibration.pinhole, pairs[0].depth)
+    depth_camera = _depth_camera(frames, camera.calibration.pinhole, (pair.depth for pair in pairs))
     depth = DepthFormat(camera.depth_scale, camera=depth_camera)
     return ImagePairs(folder.resolve().name, pairs, camera.calibration, depth, width=width, ground_truth=ground_truth)
 
@@ -69,8 +70,8 @@ def _frames(folder: Path) -> Path:
     return folder / 'frames' if (folder / 'frames' / 'color').is_dir() else folder
 
 
-def _depth_camera(frames: Path, color: PinholeCamera, depth: Path) -> PinholeCamera:
-    path, size = frames / 'intrinsic' / 'intrinsic_depth.txt', files.image_size(depth)
+def _depth_camera(frames: Path, color: PinholeCamera, depth: Iterable[Path | None]) -> PinholeCamera:
+    path, size = frames / 'intrinsic' / 'intrinsic_depth.txt', files.first_size(depth)
     if not path.exists():
         return color.resized(*size)
     return files.calibration_from_matrix(files.read_matrix(path, 4, 3), size).pinhole

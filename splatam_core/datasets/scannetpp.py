@@ -20,6 +20,7 @@ first at 1 s.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -47,16 +48,16 @@ def read(folder: Path, *, split: str = 'train', skip_bad: bool = False, width: i
         stated = {frame['file_path']: frame for frame in transforms[FRAMES[split]]}
         frames = [frame for frame in _in_order(dslr, split, stated) if not (skip_bad and frame['is_bad'])]
         camera = camera_of(folder, lambda: nerfstudio.calibration(transforms), DEPTH_SCALE)
-        poses = [nerfstudio.pose(frame, f'{path}, {frame["file_path"]}') for frame in frames]
-    names = [Path(frame['file_path']) for frame in frames]
+        names = [Path(frame['file_path']) for frame in frames]
+        depth_names = [name.with_suffix('.png') for name in names]
     images = next((f for f in ('undistorted_images', 'resized_undistorted_images') if (dslr / f).is_dir()), None)
     color = {index: dslr / images / name for index, name in enumerate(names)} if images else {}
-    depth = {index: dslr / 'undistorted_depths' / name.with_suffix('.png') for index, name in enumerate(names)}
-    depth = {index: file for index, file in depth.items() if file.exists()}
+    depth = {index: dslr / 'undistorted_depths' / name for index, name in enumerate(depth_names)}
+    depth = {index: file for index, file in depth.items() if os.path.exists(file)}
     pairs = pair_up(color, depth, dslr, 'undistorted_images/DSC00001.JPG with undistorted_depths/DSC00001.png')
     return ImagePairs(
         f'{folder.resolve().name}_{split}', pairs, camera.calibration, DepthFormat(camera.depth_scale),
-        width=width, ground_truth=lambda: trajectory(pairs, poses),
+        width=width, ground_truth=lambda: trajectory(pairs, nerfstudio.poses(frames, path)),
     )  # fmt: skip
 
 

@@ -17,11 +17,11 @@ frames; all frames are rectified to the first frame's camera. The numbers in the
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatam_core.datasets import base, files
 from splatam_core.datasets.camera_file import camera_of
@@ -42,10 +42,9 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     stated = files.read_json(path)
     color = files.numbered(folder / 'rgb', r'frame_(\d+)\.(?:jpg|png)')
     depth = files.numbered(folder / 'depth', r'frame_(\d+)\.png')
-    size = files.image_size(next(iter(color.values()))) if color else (0, 0)
+    size = files.first_size(color.values()) if color else (0, 0)
     with files.parsing(path):
         frames = {number: stated[file.stem] for number, file in color.items()}
-        poses = [_pose(frame, f'{path}, {file.stem}') for frame, file in zip(frames.values(), color.values(), strict=True)]
         cameras = {
             number: files.calibration_from_matrix(np.array(frame['intrinsic'], np.float64).reshape(3, 3), size)
             for number, frame in frames.items()
@@ -54,16 +53,22 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     expected = 'rgb/frame_000000.jpg with depth/frame_000000.png'
     pairs = pair_up(color, depth, folder, expected, rate_hz=RATE_HZ, calibrations=own)
     camera = camera_of(folder, lambda: cameras[next(iter(color))], DEPTH_SCALE)
-    depth_format = DepthFormat(camera.depth_scale, size=files.image_size(pairs[0].depth))
+    depth_format = DepthFormat(camera.depth_scale, size=files.first_size(pair.depth for pair in pairs))
     return ImagePairs(
         f'{folder.resolve().parent.name}_iphone', pairs, camera.calibration, depth_format,
-        width=width, ground_truth=lambda: trajectory(pairs, poses),
+        width=width, ground_truth=lambda: trajectory(pairs, _poses(frames, path)),
     )  # fmt: skip
 
 
-def _pose(frame: Mapping[str, Any], where: str) -> NDArray[np.float64] | None:
-    """Returns a frame's pose; None if it has none."""
-    return files.pose(np.array(frame['aligned_pose'], np.float64), where) if 'aligned_pose' in frame else None
+def _poses(frames: Mapping[int, Mapping[str, Any]], path: Path) -> list[files.Pose | None]:
+    """Returns each frame's pose; None if it has none."""
+
+    def read(number: int, frame: Mapping[str, Any]) -> files.Pose | None:
+        with files.parsing(path):
+            values = np.array(frame['aligned_pose'], np.float64) if 'aligned_pose' in frame else None
+        return None if values is None else files.pose(values, f'{path}, frame {number}')
+
+    return files.tolerated([partial(read, *frame) for frame in frames.items()], path)
 
 
 def _recognises(source: str) -> bool:

@@ -15,10 +15,11 @@ There are no stamps: the first frame is at 1 s, and the numbers in the names cou
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from splatam_core.datasets import base, files
-from splatam_core.datasets.camera_file import camera_of
+from splatam_core.datasets.camera_file import camera_of, say_assumed
 from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 from splatam_core.geometry.trajectory import Trajectory
@@ -32,27 +33,28 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     """List the frames of a folder.
 
     Raises:
-        DatasetError: there are no frames, one lacks its depth, or ``camera-intrinsics.txt`` is no 3x3 matrix.
+        DatasetError: there are no frames, too many lack their depth, or ``camera-intrinsics.txt`` is no 3x3 matrix.
         CameraError: its ``camera.yaml`` cannot be used.
     """
     color = files.numbered(folder, r'frame-(\d{6})\.color\.(?:png|jpg)')
     depth = files.numbered(folder, r'frame-(\d{6})\.depth\.png')
     pairs = pair_up(color, depth, folder, 'frame-000000.color.png (or .jpg) with frame-000000.depth.png')
-    camera = camera_of(folder, lambda: _calibration(folder, pairs[0].color), DEFAULT_DEPTH_SCALE)
+    camera = camera_of(folder, lambda: _calibration(folder, (pair.color for pair in pairs)), DEFAULT_DEPTH_SCALE)
 
     def ground_truth() -> Trajectory | None:
         posed = files.numbered(folder, r'frame-(\d{6})\.pose\.txt')
-        return trajectory(pairs, [files.read_pose(posed[number]) if number in posed else None for number in color])
+        return trajectory(pairs, files.read_poses([posed.get(number) for number in color], folder))
 
     depth_format = DepthFormat(camera.depth_scale, no_reading=NO_DEPTH)
     return ImagePairs(folder.resolve().name, pairs, camera.calibration, depth_format, width=width, ground_truth=ground_truth)
 
 
-def _calibration(folder: Path, color: Path) -> CameraCalibration:
+def _calibration(folder: Path, color: Iterable[Path]) -> CameraCalibration:
     path = folder / 'camera-intrinsics.txt'
     if not path.exists():
+        say_assumed(folder, 'the default camera of 7-Scenes (f 585, c 320 240, 640x480)')
         return DEFAULT_CAMERA
-    return files.calibration_from_matrix(files.read_matrix(path, 3), files.image_size(color))
+    return files.calibration_from_matrix(files.read_matrix(path, 3), files.first_size(color))
 
 
 def _recognises(source: str) -> bool:

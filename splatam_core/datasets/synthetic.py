@@ -42,6 +42,8 @@ CAMERA = PinholeCamera(640, 480, 525.0, 525.0, 319.5, 239.5)
 MOTIONS = {'calm': 300, 'fast': 120}
 """Number of frames in a loop, by the name of the motion."""
 LOOP_FRAMES = MOTIONS['calm']
+MAX_FRAMES = 1_000_000  # nine hours
+MAX_SEED = 2**63 - 1
 SCHEME = 'synthetic'
 OPTIONS = 'seed=N, noise=on|off, frames=N, motion=calm|fast'
 
@@ -164,11 +166,11 @@ def _recognises(source: str) -> bool:
 
 def _open(source: str, options: base.ReadOptions) -> SyntheticSequence:
     given = _parse(source)
-    asked = LOOP_FRAMES if options.last_asked is None else options.last_asked + 1
+    asked = LOOP_FRAMES if options.last_asked is None else min(options.last_asked + 1, MAX_FRAMES)
     return SyntheticSequence(
-        seed=_integer('seed', given.get('seed', '0'), 0),
+        seed=_integer('seed', given.get('seed', '0'), 0, MAX_SEED),
         noise=_choice('noise', given.get('noise', 'on'), ('on', 'off')) == 'on',
-        frames=_integer('frames', given.get('frames', str(asked)), 1),
+        frames=_integer('frames', given.get('frames', str(asked)), 1, MAX_FRAMES),
         width=options.width,
         motion=_choice('motion', given.get('motion', 'calm'), tuple(MOTIONS)),
     )
@@ -184,9 +186,9 @@ def _parse(source: str) -> dict[str, str]:
     return options
 
 
-def _integer(key: str, text: str, minimum: int) -> int:
-    if not text.isascii() or not text.isdigit() or int(text) < minimum:
-        raise DatasetError(f"{SCHEME}: {key}='{text}' must be a whole number, at least {minimum}")
+def _integer(key: str, text: str, minimum: int, maximum: int) -> int:
+    if not text.isascii() or not text.isdigit() or len(text) > 20 or not minimum <= int(text) <= maximum:
+        raise DatasetError(f"{SCHEME}: {key}='{text[:40]}' must be a whole number, at least {minimum} and at most {maximum}")
     return int(text)
 
 

@@ -1,4 +1,4 @@
-"""TUM RGB-D recordings.
+"""TUM RGB-D recordings, and those of people's own cameras in the same form.
 
 ::
 
@@ -9,28 +9,44 @@
         camera.yaml         # optional if the folder's name contains freiburg1, 2, 3 (or fr1, fr2, fr3)
         rgb/  depth/
 
-A colour image is paired with the depth image nearest in time, at most 20 ms away. Each depth
-image is used at most once, and colour images without a partner are skipped. The frame has the
-colour image's stamp.
+Instead of ``rgb.txt`` and ``depth.txt`` there may be ``associations.txt`` (ORB-SLAM's form): stamp and path of a colour image,
+then stamp and path of its depth image, or the other way round. The camera may then also be one of the files that plain folders
+have (``intrinsics.txt``, see ``folder.py``), and depth is taken as millimetres unless ``camera.yaml`` or the folder's name says
+otherwise.
+
+Stamps may be milliseconds, microseconds or nanoseconds instead of seconds. A colour image is paired with the depth image
+nearest in time, at most 20 ms away. Each depth image is used at most once, and colour images without a partner are skipped.
+The frame has the colour image's stamp.
 """
 
 from __future__ import annotations
 
+import heapq
+import logging
 import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splatam_core.datasets import base
-from splatam_core.datasets.camera_file import camera_of
+from splatam_core.datasets import base, files
+from splatam_core.datasets.camera_file import CameraFile, DatasetCamera, find_camera_file, say_assumed
+from splatam_core.datasets.folder import find_intrinsics
+from splatam_core.datasets.icl import says_icl
 from splatam_core.datasets.pairs import DepthFormat, ImagePair, ImagePairs
 from splatam_core.errors import DatasetError
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
-from splatam_core.geometry.trajectory import read_trajectory, stamp_from_text, stamp_text
+from splatam_core.geometry.stamps import guess_unit, stamp_number, stamp_text
+from splatam_core.geometry.trajectory import read_ground_truth, warn_of_unit
+from splatam_core.text_files import read_text
 
 DEFAULT_DEPTH_SCALE = 5000.0
+MILLIMETRES = 1000.0
+ASSOCIATIONS = ('associations.txt', 'association.txt', 'associated.txt', 'associate.txt')
 MAX_INTERVAL_NS = 20_000_000
 
 KNOWN_CAMERAS = {
@@ -47,6 +63,22 @@ KNOWN_CAMERAS = {
 """The calibrations published with the dataset; freiburg3 images are already rectified."""
 
 
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _Listed:
+    """An image of a list.
+
+    Attributes:
+        stamp_ns: time of the exposure.
+        name: its path, as in the list.
+    """
+
+    stamp_ns: int
+    name: str
+
+
 def read(folder: Path, *, width: int | None = None, max_interval_ns: int = MAX_INTERVAL_NS) -> ImagePairs:
     """Read the lists of a folder and pair its images.
 
@@ -54,41 +86,92 @@ def read(folder: Path, *, width: int | None = None, max_interval_ns: int = MAX_I
         DatasetError: a list is missing or broken, no images pair up, or the camera is unknown.
         CameraError: its ``camera.yaml`` cannot be used.
     """
-    camera = camera_of(folder, lambda: _known_camera(folder), DEFAULT_DEPTH_SCALE)
+    associations = _associations(folder)
+    pairs = _pairs(folder, max_interval_ns) if associations is None else _associated(folder, associations)
+    camera = _camera(folder, pairs, is_own=associations is not None)
     path = folder / 'groundtruth.txt'
     return ImagePairs(
-        folder.resolve().name, _pairs(folder, max_interval_ns), camera.calibration, DepthFormat(camera.depth_scale),
-        width=width, ground_truth=lambda: read_trajectory(path) if path.exists() else None,
+        folder.resolve().name, pairs, camera.calibration, DepthFormat(camera.depth_scale),
+        width=width, ground_truth=lambda: read_ground_truth(path) if path.exists() else None,
     )  # fmt: skip
 
 
 def associate(a_ns: NDArray[np.int64], b_ns: NDArray[np.int64], max_interval_ns: int) -> list[tuple[int, int]]:
     """Pair two lists of increasing stamps, nearest pairs first; each stamp is in at most one pair.
 
+    The two nearest stamps that are still without partner are always neighbours in time. So a queue of neighbours is enough,
+    in which each pair that is taken makes new neighbours.
+
     Returns:
         Indices into both lists, in the order of the first.
     """
-    first = np.searchsorted(b_ns, a_ns - max_interval_ns, side='left')
-    last = np.searchsorted(b_ns, a_ns + max_interval_ns, side='right')
-    near = [(abs(int(a_ns[i] - b_ns[j])), i, j) for i in range(len(a_ns)) for j in range(first[i], last[i])]
+    stamps = np.concatenate([a_ns, b_ns])
+    order = np.argsort(stamps, kind='stable').tolist()
+    times, of_a = stamps.tolist(), len(a_ns)
+    before = dict(zip(order[1:], order))
+    after = dict(pairwise(order))
+    queue: list[tuple[int, int, int]] = []
+
+    def offer(one: int | None, other: int | None) -> None:
+        if one is None or other is None or (one < of_a) == (other < of_a):
+            return
+        i, j = min(one, other), max(one, other)
+        if abs(times[i] - times[j]) <= max_interval_ns:
+            heapq.heappush(queue, (abs(times[i] - times[j]), i, j))
+
+    for one, other in pairwise(order):
+        offer(one, other)
     partner: dict[int, int] = {}
     taken: set[int] = set()
-    for _, i, j in sorted(near):
-        if i not in partner and j not in taken:
-            partner[i] = j
-            taken.add(j)
+    while queue:
+        _, i, j = heapq.heappop(queue)
+        if i in partner or j in taken:
+            continue
+        partner[i] = j - of_a
+        taken.add(j)
+        for index in (i, j):
+            left, right = before.pop(index, None), after.pop(index, None)
+            if left is not None:
+                after.pop(left)
+            if right is not None:
+                before.pop(right)
+            if left is not None and right is not None:
+                after[left], before[right] = right, left
+                offer(left, right)
     return sorted(partner.items())
 
 
-def _known_camera(folder: Path) -> CameraCalibration:
-    """Returns the published calibration of the camera in the folder's name."""
-    match = re.search(r'(?<![a-z])(?:freiburg|fr)([123])(?!\d)', folder.resolve().name.lower())
-    if match is None:
+# --- camera ---
+
+
+def _camera(folder: Path, pairs: Sequence[ImagePair], is_own: bool) -> DatasetCamera:
+    """Returns the camera. is_own: True if the folder has the form that people use for their own cameras."""
+    stated: CameraFile | None = find_camera_file(folder)
+    known = _known_camera(folder)
+    if stated is None and is_own:
+        stated = find_intrinsics(folder, (pair.color for pair in pairs))
+    if stated is None and known is None:
         raise DatasetError(
             f"{folder}: the camera is unknown, because the folder's name does not contain freiburg1, freiburg2 or freiburg3; "
             'put a camera.yaml with width, height, fx, fy, cx, cy into the folder'
         )
-    return KNOWN_CAMERAS[match.group(1)]
+    if stated is None and known is not None:
+        say_assumed(folder, "the camera that the folder's name says, as published with the TUM dataset,")
+        return DatasetCamera(known, DEFAULT_DEPTH_SCALE)
+    assert stated is not None
+    if stated.depth_scale is not None or not is_own or known is not None:
+        return DatasetCamera(stated.calibration, stated.depth_scale or DEFAULT_DEPTH_SCALE)
+    _log.warning('%s: states no depth_scale; depth is taken as millimetres; state it in a camera.yaml if it is another', folder)
+    return DatasetCamera(stated.calibration, MILLIMETRES)
+
+
+def _known_camera(folder: Path) -> CameraCalibration | None:
+    """Returns the published calibration of the camera in the folder's name; None if there is none in it."""
+    match = re.search(r'(?<![a-z])(?:freiburg|fr)([123])(?!\d)', folder.resolve().name.lower())
+    return KNOWN_CAMERAS[match.group(1)] if match else None
+
+
+# --- lists ---
 
 
 def _pairs(folder: Path, max_interval_ns: int) -> list[ImagePair]:
@@ -99,42 +182,94 @@ def _pairs(folder: Path, max_interval_ns: int) -> list[ImagePair]:
             f'{folder}: none of {len(rgb)} colour and {len(depth)} depth images are within '
             f'{max_interval_ns / 1e6:g} ms of each other; do the stamps of both lists come from the same clock?'
         )
-    return [ImagePair(rgb[i][0], folder / rgb[i][1], folder / depth[j][1]) for i, j in pairs]
+    found = [(rgb[i], depth[j]) for i, j in pairs]
+    return [ImagePair(c.stamp_ns, files.listed(folder, c.name), files.listed(folder, d.name)) for c, d in found]
 
 
-def _stamps_ns(rows: list[tuple[int, str]]) -> NDArray[np.int64]:
-    return np.array([stamp_ns for stamp_ns, _ in rows], np.int64)
+def _stamps_ns(rows: list[_Listed]) -> NDArray[np.int64]:
+    return np.array([row.stamp_ns for row in rows], np.int64)
 
 
-def _read_list(path: Path) -> list[tuple[int, str]]:
-    """Returns rows of (stamp_ns, path) with increasing stamps."""
-    try:
-        lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f'{path}: cannot be read: {error}') from None
-    rows = [
-        _parse_row(path, number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith('#')
+def _associations(folder: Path) -> Path | None:
+    """Returns the list that states pairs; None if there are lists of colour and depth, or none."""
+    if (folder / 'rgb.txt').is_file() and (folder / 'depth.txt').is_file():
+        return None
+    return next((folder / name for name in ASSOCIATIONS if (folder / name).is_file()), None)
+
+
+def _associated(folder: Path, path: Path) -> list[ImagePair]:
+    """Read a list of pairs. Which of the two images is depth is told by the paths; if they do not tell, it is the second."""
+    rows = list(_rows(path, 'stamp path stamp path', lambda line: _fields(line.split(), 4)))
+    if not rows:
+        raise DatasetError(f'{path}: no pair in it; expected lines with stamp, path of colour, stamp, path of depth')
+    first, second = _listed(path, [row[:2] for row in rows]), _listed(path, [row[2:] for row in rows])
+    says_depth = [sum('depth' in row.name.lower() for row in side) for side in (first, second)]
+    color, depth = (second, first) if says_depth[0] > says_depth[1] else (first, second)
+    _check_increasing(path, color)
+    return [
+        ImagePair(c.stamp_ns, files.listed(folder, c.name), files.listed(folder, d.name)) for c, d in zip(color, depth, strict=True)
     ]
-    for (before, _), (after, _) in pairwise(rows):
-        if after <= before:
-            raise DatasetError(f'{path}: stamps must increase, but {stamp_text(after)} follows {stamp_text(before)}')
+
+
+def _read_list(path: Path) -> list[_Listed]:
+    """Returns the images of a list with increasing stamps."""
+    rows = _listed(path, list(_rows(path, 'stamp path', lambda line: _fields(line.split(maxsplit=1), 2))))
+    _check_increasing(path, rows)
     return rows
 
 
-def _parse_row(path: Path, number: int, line: str) -> tuple[int, str]:
+def _rows(path: Path, expected: str, parse: Callable[[str], list[str]]) -> Iterable[list[str]]:
+    """Yields the fields of each line that is no comment."""
+    for number, line in enumerate(read_text(path, DatasetError).splitlines(), 1):
+        if line.strip() and not line.lstrip().startswith('#'):
+            try:
+                yield parse(line)
+            except ValueError:
+                raise DatasetError(f"{path}:{number}: expected '{expected}', got '{line.strip()[:200]}'") from None
+
+
+def _fields(fields: list[str], count: int) -> list[str]:
+    """Returns stamps and paths in turn.
+
+    Raises:
+        ValueError: there are more or fewer, or a stamp is no number.
+    """
+    if len(fields) != count:
+        raise ValueError
+    for stamp in fields[::2]:
+        stamp_number(stamp)
+    return [field.strip() for field in fields]
+
+
+def _listed(path: Path, rows: list[list[str]]) -> list[_Listed]:
+    numbers: list[Decimal] = [stamp_number(stamp) for stamp, _ in rows]
+    unit = guess_unit(numbers)
+    warn_of_unit(unit, path)
     try:
-        stamp, name = line.split(maxsplit=1)
-        return stamp_from_text(stamp), name.strip()
-    except ValueError:
-        raise DatasetError(f"{path}:{number}: expected 'stamp path', got '{line.strip()}'") from None
+        return [_Listed(unit.stamp_ns(number), name) for number, (_, name) in zip(numbers, rows, strict=True)]
+    except ValueError as error:
+        raise DatasetError(f'{path}: {error}') from None
+
+
+def _check_increasing(path: Path, rows: list[_Listed]) -> None:
+    for before, after in pairwise(rows):
+        if after.stamp_ns <= before.stamp_ns:
+            raise DatasetError(
+                f'{path}: stamps must increase, but {stamp_text(after.stamp_ns)} follows {stamp_text(before.stamp_ns)}'
+            )
 
 
 def _recognises(source: str) -> bool:
-    return (Path(source) / 'rgb.txt').is_file() and (Path(source) / 'depth.txt').is_file()
+    return _accepts(source) and (_associations(Path(source)) is None or not says_icl(Path(source)))
+
+
+def _accepts(source: str) -> bool:
+    folder = Path(source)
+    return ((folder / 'rgb.txt').is_file() and (folder / 'depth.txt').is_file()) or _associations(folder) is not None
 
 
 def _open(source: str, options: base.ReadOptions) -> ImagePairs:
     return read(Path(source), width=options.width)
 
 
-FORMAT = base.Format('tum', 'a folder with rgb.txt and depth.txt', _recognises, _open)
+FORMAT = base.Format('tum', 'a folder with rgb.txt and depth.txt, or associations.txt', _recognises, _open, accepts=_accepts)

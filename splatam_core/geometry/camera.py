@@ -21,6 +21,13 @@ DISTORTION_COEFFICIENTS = {
     'equidistant': (4,),
 }
 
+MAX_SIDE = 16384
+"""The largest width and height of images."""
+
+FOCAL_LENGTHS = (1e-2, 1e6)
+LARGEST_PRINCIPAL_POINT = 1e6
+LARGEST_COEFFICIENT = 1e6
+
 
 @dataclass(frozen=True, slots=True)
 class PinholeCamera:
@@ -36,10 +43,19 @@ class PinholeCamera:
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
             raise CameraError(f'camera size {self.width}x{self.height}: both must be at least 1 pixel')
+        if self.width > MAX_SIDE or self.height > MAX_SIDE:
+            raise CameraError(f'camera size {self.width}x{self.height}: both must be at most {MAX_SIDE} pixels')
         if not (np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() and self.fx > 0 and self.fy > 0):
             raise CameraError(
                 f'camera intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}: focal lengths must be '
                 'positive and all four finite; is the camera calibrated?'
+            )
+        shortest, longest = FOCAL_LENGTHS
+        if not (shortest <= min(self.fx, self.fy) and max(self.fx, self.fy) <= longest):
+            raise CameraError(f'camera intrinsics fx={self.fx} fy={self.fy}: must be {shortest:g} to {longest:g} pixels')
+        if max(abs(self.cx), abs(self.cy)) > LARGEST_PRINCIPAL_POINT:
+            raise CameraError(
+                f'camera intrinsics cx={self.cx} cy={self.cy}: must be within {LARGEST_PRINCIPAL_POINT:g} pixels of the image'
             )
 
     @property
@@ -105,6 +121,8 @@ class CameraCalibration:
         allowed = DISTORTION_COEFFICIENTS.get(self.distortion_model)
         if allowed is None:
             raise CameraError(f"distortion model '{self.distortion_model}' is not one of {', '.join(DISTORTION_COEFFICIENTS)}")
+        if not all(abs(value) <= LARGEST_COEFFICIENT for value in self.distortion):
+            raise CameraError(f'distortion {list(self.distortion)}: coefficients must be within {LARGEST_COEFFICIENT:g}')
         if self.is_distorted and len(self.distortion) not in allowed:
             raise CameraError(
                 f'{self.distortion_model} takes {" or ".join(map(str, allowed))} coefficients, got {len(self.distortion)}'

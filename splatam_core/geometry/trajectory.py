@@ -5,9 +5,10 @@ The text form is the TUM format, ``stamp tx ty tz qx qy qz qw`` per line, camera
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,22 @@ from numpy.typing import NDArray
 
 from splatam_core.errors import DatasetError
 from splatam_core.geometry import se3
+from splatam_core.geometry.stamps import SECONDS, StampUnit, guess_unit, stamp_number, stamp_text
+from splatam_core.geometry.stamps import stamp_from_text as stamp_from_text
+from splatam_core.text_files import read_text
 
 MAX_GROUND_TRUTH_GAP_NS = 500_000_000
 """A stamp between two true poses further apart than this has no true pose: frames there are not scored."""
 
 STAMP_ROUNDING_NS = 1_000_000
 """A stamp this close to a true pose has that pose, even outside the trajectory's span: files round their stamps."""
+
+QUATERNION_LENGTHS = (1e-6, 1e6)
+"""A quaternion that is shorter or longer states no rotation."""
+
+LARGEST_POSITION_M = 1e9
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,23 +102,6 @@ def _interpolated_rotation(truth: Trajectory, stamp_ns: int) -> NDArray[np.float
     return R_before @ se3.exp(turn)[:3, :3]
 
 
-def stamp_text(stamp_ns: int) -> str:
-    """Returns seconds with nine decimals, which is exact."""
-    return f'{stamp_ns // 1_000_000_000}.{stamp_ns % 1_000_000_000:09d}'
-
-
-def stamp_from_text(text: str) -> int:
-    """Returns the nanoseconds of a decimal number of seconds, exactly.
-
-    Raises:
-        ValueError: the text is not a finite decimal number.
-    """
-    try:
-        return int((Decimal(text) * 1_000_000_000).to_integral_value())
-    except (InvalidOperation, OverflowError):
-        raise ValueError(f"'{text}' is not a number of seconds") from None
-
-
 def pose_line(stamp_ns: int, T_world_cam: NDArray[np.float64]) -> str:
     """Returns one line of a TUM trajectory, without a newline."""
     q = se3.quaternion_from_rotation(T_world_cam[:3, :3])
@@ -116,34 +110,145 @@ def pose_line(stamp_ns: int, T_world_cam: NDArray[np.float64]) -> str:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Reads a TUM trajectory; lines that start with ``#`` are comments.
+    """Reads a TUM trajectory whose every line must be a pose; lines that start with ``#`` are comments.
 
     Raises:
-        DatasetError: the file cannot be read, a line is not eight numbers, or the stamps do not increase.
+        DatasetError: the file cannot be read, a line is no pose, or the stamps do not increase.
     """
-    try:
-        lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f'{path}: cannot be read: {error}') from None
-    rows = [
-        _parse_line(path, number, line)
-        for number, line in enumerate(lines, 1)
-        if line.strip() and not line.lstrip().startswith('#')
-    ]
+    rows = []
+    for line in _lines(path):
+        if line.pose is None or not line.pose.is_known:
+            raise DatasetError(line.fault(path))
+        try:
+            rows.append((SECONDS.stamp_ns(line.pose.stamp), line.pose.values))
+        except ValueError as error:
+            raise DatasetError(f'{path}:{line.number}: {error}') from None
     return trajectory_from_rows(rows, str(path))
 
 
-def _parse_line(path: Path, number: int, line: str) -> tuple[int, list[float]]:
+def read_ground_truth(path: Path) -> Trajectory:
+    """Reads a TUM trajectory of true poses.
+
+    Poses that are unknown (NaN, infinite, or without rotation), lines that are no pose, and further poses of the same stamp
+    are left out, and counted in a warning. Stamps may be milliseconds, microseconds or nanoseconds, which a warning says.
+
+    Raises:
+        DatasetError: the file cannot be read, more than a tenth of the lines are no poses, no pose is known, or the stamps do
+            not increase.
+    """
+    lines = _lines(path)
+    poses = [line.pose for line in lines if line.pose is not None]
+    faulty = [line for line in lines if line.pose is None]
+    if too_many(len(faulty), len(lines)):
+        raise DatasetError(faulty[0].fault(path))
+    known = [pose for pose in poses if pose.is_known]
+    if poses and not known:
+        raise DatasetError(f'{path}: none of its {len(poses)} poses is known: each holds NaN, infinity or no rotation')
+    rows = _rows(path, known)
+    counts = {
+        'no poses': len(faulty), 'unknown': len(poses) - len(known), 'of a stamp that is there already': len(known) - len(rows)
+    }  # fmt: skip
+    left_out = [f'{count} {why}' for why, count in counts.items() if count]
+    if left_out:
+        _log.warning('%s: of %d lines with poses these are left out: %s', path, len(lines), ', '.join(left_out))
+    return trajectory_from_rows(rows, str(path))
+
+
+def too_many(faults: int, total: int) -> bool:
+    """Returns True if so many of the files or lines of a recording are faulty that it cannot be used: more than a tenth.
+
+    One fault is never too many, unless there is nothing else.
+    """
+    return faults > 0 and (faults == total or faults > max(1, total // 10))
+
+
+def warn_of_unit(unit: StampUnit, name: object) -> None:
+    """Says so if stamps are no seconds."""
+    if unit is not SECONDS:
+        _log.warning('%s: stamps look like %s, and are read as such', name, unit.name)
+
+
+def _rows(path: Path, poses: Sequence[_StatedPose]) -> list[tuple[int, Sequence[float]]]:
+    """Returns (stamp_ns, [tx ty tz qx qy qz qw]) of the first pose of each stamp."""
+    unit = guess_unit([pose.stamp for pose in poses])
+    warn_of_unit(unit, path)
+    rows: list[tuple[int, Sequence[float]]] = []
+    for pose in poses:
+        try:
+            stamp_ns = unit.stamp_ns(pose.stamp)
+        except ValueError as error:
+            raise DatasetError(f'{path}: {error}') from None
+        if not rows or stamp_ns != rows[-1][0]:
+            rows.append((stamp_ns, pose.values))
+    return rows
+
+
+@dataclass(frozen=True, slots=True)
+class _StatedPose:
+    """The numbers of a line.
+
+    Attributes:
+        stamp: as in the file.
+        values: tx ty tz qx qy qz qw.
+    """
+
+    stamp: Decimal
+    values: list[float]
+
+    @property
+    def is_known(self) -> bool:
+        """False if the numbers mark an unknown pose."""
+        return is_pose(self.values[:3], self.values[3:])
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """A line that is no comment.
+
+    Attributes:
+        number: from 1.
+        text: the line.
+        pose: None if there are no eight numbers in it.
+    """
+
+    number: int
+    text: str
+    pose: _StatedPose | None
+
+    def fault(self, path: Path) -> str:
+        """Returns what is wrong with a line that is no known pose."""
+        shown = self.text.strip()[:200]
+        return f"{path}:{self.number}: expected 'stamp tx ty tz qx qy qz qw' with a non-zero quaternion, got '{shown}'"
+
+
+def _lines(path: Path) -> list[_Line]:
+    """Returns the lines of a trajectory that are no comments."""
+    lines = read_text(path, DatasetError).splitlines()
+    numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith('#')]
+    return [_Line(number, line, _stated_pose(line)) for number, line in numbered]
+
+
+def _stated_pose(line: str) -> _StatedPose | None:
     fields = line.replace(',', ' ').split()
+    if len(fields) != 8 and line.count(',') == 7:
+        fields = [field.strip() or 'nan' for field in line.split(',')]  # a table with empty cells
+    if len(fields) != 8:
+        return None
     try:
-        stamp_ns, values = stamp_from_text(fields[0]), [float(field) for field in fields[1:]]
-        if len(values) != 7 or not np.isfinite(values).all() or not any(values[3:]):
-            raise ValueError
+        return _StatedPose(stamp_number(fields[0]), [_value(field) for field in fields[1:]])
     except ValueError:
-        raise DatasetError(
-            f"{path}:{number}: expected 'stamp tx ty tz qx qy qz qw' with a non-zero quaternion, got '{line.strip()}'"
-        ) from None
-    return stamp_ns, values
+        return None
+
+
+def _value(text: str) -> float:
+    return float('nan') if text.lower() in ('none', 'null', 'na', 'n/a', '-') else float(text)
+
+
+def is_pose(position: Sequence[float], quaternion: Sequence[float]) -> bool:
+    """Returns False for an unknown pose: it holds NaN, infinity or impossible numbers, or its quaternion has no length."""
+    shortest, longest = QUATERNION_LENGTHS
+    is_near = all(abs(value) <= LARGEST_POSITION_M for value in position)
+    return is_near and all(abs(value) <= longest for value in quaternion) and any(abs(value) >= shortest for value in quaternion)
 
 
 def trajectory_from_rows(rows: Sequence[tuple[int, Sequence[float]]], name: str) -> Trajectory:

@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core.errors import CameraError, FrameError
-from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
+from splatam_core.geometry.camera import MAX_SIDE, CameraCalibration, PinholeCamera
+from splatam_core.images.headers import MAX_PIXELS
 from splatam_core.types import RgbdFrame
 
 Value = TypeVar('Value', np.uint8, np.float32)
+MIN_SIDE = 16
 
 
 @dataclass(frozen=True)
@@ -39,8 +41,14 @@ class FrameFactory:
     rectified: PinholeCamera | None = None
 
     def __post_init__(self) -> None:
-        if self.width is not None and self.width < 16:
-            raise CameraError(f'width {self.width}: frames must be at least 16 pixels wide')
+        if self.width is not None and not MIN_SIDE <= self.width <= MAX_SIDE:
+            raise CameraError(f'width {self.width}: frames must be at least {MIN_SIDE} and at most {MAX_SIDE} pixels wide')
+        camera = self.camera
+        if min(camera.width, camera.height) < MIN_SIDE or camera.width * camera.height > MAX_PIXELS:
+            raise CameraError(
+                f'frames would be {camera.width}x{camera.height} pixels: both must be at least {MIN_SIDE}, and a frame at most '
+                f'{MAX_PIXELS} pixels; choose another width'
+            )
 
     @cached_property
     def camera(self) -> PinholeCamera:

@@ -8,12 +8,12 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rclpy.duration import Duration, Infinite
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
 from splatam_core.datasets.bag.qos import INFINITE_NS, OfferedQos
 from splatam_core.datasets.bag.recording import RecordedTopic
+from splatam_core.text_files import read_yaml
 from splatam_ros.process import RosError
 
 IMAGE_DEPTH, OTHER_DEPTH = 50, 1000  # messages kept until they are acknowledged
@@ -66,10 +66,7 @@ def read_overrides(path: Path) -> dict[str, Policies]:
     Raises:
         RosError: it cannot be read, or has an entry that is no QoS policy.
     """
-    try:
-        topics = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise RosError(f'{path}: cannot be read: {error}') from None
+    topics = read_yaml(path, RosError)
     if not isinstance(topics, dict) or not all(isinstance(policies, dict) for policies in topics.values()):
         raise RosError(f"{path}: expected topics with their policies, for example '/tf_static: {{depth: 1}}'")
     return {

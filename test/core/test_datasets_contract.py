@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import logging
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from splatam_core.cli import main
 from splatam_core.datasets import icl, replica, replica_v2
 from splatam_core.datasets.base import FIRST_STAMP_NS
 from splatam_core.datasets.registry import READERS, _reader, open_sequence
-from splatam_core.errors import CameraError, DatasetError
+from splatam_core.errors import CameraError, DatasetError, FrameError
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
 
@@ -192,11 +193,25 @@ def test_recognised_by_one_reader_only(source, layout):
     assert certain == [layout.format]
 
 
-def test_missing_depth_is_said_at_once(source, layout):
+def test_one_missing_depth_costs_one_frame(source, layout):
     if layout.depth is None:
-        pytest.skip('a list names the files: the error comes with the frame')
+        pytest.skip('a list names the files; test/field has such recordings')
     (source / layout.depth).unlink()
-    with pytest.raises(DatasetError, match='1 of 3 colour images have no depth'):
+    sequence = read(source, layout)
+    assert len(sequence) == 3
+    with pytest.raises(FrameError, match='there is no depth image for it'):
+        sequence[1]
+    assert sequence[0].depth_m.any() and sequence[2].depth_m.any()
+
+
+def test_many_missing_depths_are_said_at_once(source, layout):
+    if layout.depth is None:
+        pytest.skip('a list names the files; test/field has such recordings')
+    depth = source / layout.depth
+    for path in depth.parent.iterdir():
+        if re.sub(r'\d+', '0', path.name) == re.sub(r'\d+', '0', depth.name):
+            path.unlink()
+    with pytest.raises(DatasetError, match='3 of 3 colour images have no depth, and at most a tenth may lack it'):
         read(source, layout)
 
 
@@ -251,10 +266,8 @@ def write(name: str, folder: Path) -> Path:
         ('nerfcapture', 'transforms.json', '{"frames": [{"file_path": "rgb/0.png"}]}', 'none of 1 frames has a depth'),
         ('nerfcapture', 'transforms.json', '{"frames": [{"depth_path": "0.png"}]}', "'w' is missing"),
         ('icl', 'livingRoom2.gt.freiburg', '1 2 3', 'expected .frame tx ty tz qx qy qz qw. .*, got 3 numbers'),
-        ('folder', 'poses/00001.txt', 'x', r'poses/00001\.txt: cannot be read'),
         ('folder', 'camera.yaml', 'width: 3', r'camera\.yaml: missing cx, cy, fx, fy, height'),
         ('folder realsense', 'camera.yaml', 'pose_axes: up', r'camera\.yaml: missing'),
-        ('folder realsense', 'poses/00001.npy', 'x', r'00001\.npy: is no complete \.npy file of numbers'),
         ('folder distorted', 'camera.yaml', 'width: 3\ndistorti', r'camera\.yaml: cannot be read: .*scanning'),
         ('folder azure', 'intrinsic.json', '{"width": 96}', r"intrinsic\.json: 'intrinsic_matrix' is missing"),
         ('folder azure', 'trajectory.log', '1 2 3', r'trajectory\.log: expected blocks of 3 \+ 16 numbers'),
@@ -267,6 +280,24 @@ def test_broken_files_are_named(tmp_path, name, file, text, message):
     with pytest.raises((DatasetError, CameraError), match=message) as caught:
         read(source, LAYOUTS[name]).ground_truth()
     assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('name', 'file', 'message'),
+    [
+        ('folder', 'poses/0000{}.txt', r'poses/0000\d\.txt: cannot be read'),
+        ('folder realsense', 'poses/0000{}.npy', r'0000\d\.npy: is no complete \.npy file of numbers'),
+        ('scannet', 'pose/{}.txt', r'pose/\d\.txt: cannot be read'),
+    ],
+)
+def test_one_broken_pose_costs_one_pose(tmp_path, caplog, name, file, message):
+    source = write(name, tmp_path)
+    (source / file.format(1)).write_text('x')
+    assert len(read(source, LAYOUTS[name]).ground_truth()) == 2
+    assert re.search(f'1 of 3 true poses cannot be read and are left out: .*{message}', caplog.text)
+    (source / file.format(2)).write_text('x')
+    with pytest.raises(DatasetError, match=message):
+        read(source, LAYOUTS[name]).ground_truth()
 
 
 # --- what some datasets have of their own ---

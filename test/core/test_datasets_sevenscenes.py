@@ -103,10 +103,12 @@ def test_broken_pose(tmp_path, text, message):
         sevenscenes.read(tmp_path).ground_truth()
 
 
-def test_missing_depth_is_said_at_once(tmp_path):
-    write_scene(tmp_path, [0, 1, 2])
-    (tmp_path / 'frame-000001.depth.png').unlink()
-    with pytest.raises(DatasetError, match=r'1 of 3 colour images have no depth.*frame-000001\.color\.png'):
+def test_missing_depth_is_said_at_once_where_much_is_missing(tmp_path):
+    write_scene(tmp_path, list(range(6)))
+    for number in (1, 2, 3, 5):
+        (tmp_path / f'frame-00000{number}.depth.png').unlink()
+    listed = r'frame-000001\.color\.png, frame-000002\.color\.png, frame-000003\.color\.png and so on'
+    with pytest.raises(DatasetError, match=f'4 of 6 colour images have no depth.*: {listed}'):
         sevenscenes.read(tmp_path)
 
 

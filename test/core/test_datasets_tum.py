@@ -11,7 +11,7 @@ import pytest
 from splatam_core.datasets import tum
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.datasets.tum import KNOWN_CAMERAS, associate
-from splatam_core.errors import CameraError, DatasetError
+from splatam_core.errors import CameraError, DatasetError, FrameError
 
 CAMERA_YAML = 'width: 64\nheight: 48\nfx: 50\nfy: 51\ncx: 31.5\ncy: 23.5\n'
 BASE = 1305031000
@@ -119,15 +119,57 @@ def test_broken_list(tmp_path, line, message):
         tum.read(folder)
 
 
-def test_missing_and_broken_images_say_which(tmp_path):
+def cut(path, length):
+    path.write_bytes(path.read_bytes()[:length])
+
+
+@pytest.mark.parametrize(
+    ('damage', 'message'),
+    [
+        (lambda folder: (folder / 'rgb/1.png').unlink(), r'rgb/1\.png: cannot be read: No such file'),
+        (
+            lambda folder: (folder / 'rgb/1.png').write_bytes((folder / 'rgb/2.png').read_bytes()[:20]),
+            r'rgb/1\.png: is not an image',
+        ),
+        (
+            lambda folder: (folder / 'rgb/1.png').write_bytes((folder / 'rgb/2.png').read_bytes()[:60]),
+            r'rgb/1\.png: is not an image',
+        ),
+        (lambda folder: cv2.imwrite(str(folder / 'depth/1.png'), np.zeros((48, 64, 3), np.uint8)), '16 bits'),
+    ],
+)
+def test_missing_and_broken_images_cost_one_frame(tmp_path, damage, message):
     folder = write_tum(tmp_path, [1.0, 2.0, 3.0], [1.0, 2.0, 3.0])
-    (folder / 'rgb/0.png').unlink()
-    (folder / 'rgb/1.png').write_bytes((folder / 'rgb/2.png').read_bytes()[:20])
-    cv2.imwrite(str(folder / 'depth/2.png'), np.zeros((48, 64, 3), np.uint8))
+    damage(folder)
     sequence = tum.read(folder)
-    for index, message in enumerate([r'rgb/0\.png: cannot be read', r'rgb/1\.png: is not an image', '16 bits']):
-        with pytest.raises(DatasetError, match=message):
-            sequence[index]
+    with pytest.raises(FrameError, match=message):
+        sequence[1]
+    assert sequence[0].depth_m.any() and sequence[2].depth_m.any()
+
+
+def by_trying_all_pairs(a, b, interval):
+    """Pairs as ``associate`` states them: nearest first, each stamp once."""
+    near = sorted((abs(x - y), i, j) for i, x in enumerate(a) for j, y in enumerate(b) if abs(x - y) <= interval)
+    pairs: dict[int, int] = {}
+    for _, i, j in near:
+        if i not in pairs and j not in pairs.values():
+            pairs[i] = j
+    return sorted(pairs.items())
+
+
+@pytest.mark.parametrize('spread', [15, 30, 100])
+def test_associate_equals_trying_all_pairs(spread):
+    rng = np.random.default_rng(spread)
+    for _ in range(1000):
+        a, b = (np.sort(rng.choice(spread, rng.integers(0, 12), replace=False)).astype(np.int64) for _ in range(2))
+        interval = int(rng.integers(0, 12))
+        assert associate(a, b, interval) == by_trying_all_pairs(a.tolist(), b.tolist(), interval)
+
+
+def test_near_stamps_take_no_quadratic_time_or_memory():
+    """These lists have 400 million pairs within 20 ms of each other, which would fill the memory."""
+    stamps = np.arange(20_000, dtype=np.int64) * 10
+    assert associate(stamps, stamps + 3, 20_000_000) == [(i, i) for i in range(20_000)]
 
 
 def test_broken_truth_is_an_error_not_a_missing_truth(tmp_path):

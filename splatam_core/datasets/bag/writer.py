@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,16 @@ from msg_adapters.encodings import DepthEncoding
 from msg_adapters.factory import RosbagsMessages
 from splatam_core.datasets.bag.topics import DEPTH_TOPIC, GROUND_TRUTH_TOPIC, INFO_TOPIC, RGB_TOPIC
 from splatam_core.datasets.bag.typestore import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POSE_STAMPED, ros2_types, serialize
-from splatam_core.datasets.base import Sequence
+from splatam_core.datasets.base import Sequence, frame_or_none
+from splatam_core.errors import FrameError, SplatamError
 from splatam_core.types import RgbdFrame
 
 COMPRESSED_RGB_TOPIC, COMPRESSED_DEPTH_TOPIC = f'{RGB_TOPIC}/compressed', f'{DEPTH_TOPIC}/compressedDepth'
 CAMERA_FRAME, WORLD_FRAME = 'camera_optical_frame', 'world'
 MILLIMETRES = 1000.0
+
+_log = logging.getLogger(__name__)
+
 RELIABLE = Qos(
     history=QosHistory.KEEP_LAST,
     depth=10,
@@ -70,7 +75,11 @@ def _messages(
     encoding: DepthEncoding = '16UC1' if sequence.depth_scale == MILLIMETRES else '32FC1'
     frame_messages = _compressed_messages if compressed else _raw_messages
     for index in indices:
-        frame = sequence[index]
+        try:
+            frame = sequence[index]
+        except FrameError as error:
+            _log.warning('frame %d is left out: %s', index, error)
+            continue
         while pending and pending[-1][0] <= frame.stamp_ns:
             yield _pose_message(factory, *pending.pop())
         yield INFO_TOPIC, frame.stamp_ns, camera_info.info_message(factory, _parameters(frame), frame.stamp_ns)
@@ -108,11 +117,22 @@ def _covering(sequence: Sequence) -> list[tuple[int, NDArray[np.float64]]]:
 
     Between these, the pose of every frame can be interpolated.
     """
-    ground_truth = sequence.ground_truth()
+    try:
+        ground_truth = sequence.ground_truth()
+    except SplatamError as error:
+        _log.warning('the ground truth is left out: %s', error)
+        return []
     if ground_truth is None:
         return []
     stamps_ns = ground_truth.stamps_ns
-    first_ns, last_ns = sequence[0].stamp_ns, sequence[len(sequence) - 1].stamp_ns
+    first, last = (_first_readable(sequence, indices) for indices in (range(len(sequence)), reversed(range(len(sequence)))))
+    if first is None or last is None:
+        return []
+    first_ns, last_ns = first.stamp_ns, last.stamp_ns
     start = max(int(np.searchsorted(stamps_ns, first_ns, side='right')) - 1, 0)
     stop = int(np.searchsorted(stamps_ns, last_ns, side='left')) + 1
     return [(int(stamp), T) for stamp, T in zip(stamps_ns[start:stop], ground_truth.T_world_cam[start:stop], strict=True)]
+
+
+def _first_readable(sequence: Sequence, indices: Iterable[int]) -> RgbdFrame | None:
+    return next((frame for index in indices if (frame := frame_or_none(sequence, index)) is not None), None)
