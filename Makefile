@@ -14,12 +14,13 @@ TEST_WORKERS ?= 2
 export SPLATAM_DATA ?= $(abspath ../shared/data)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup test test-quick lint format docs hooks tf2_msgs demo paper-tables colcon check-aarch64 clean
+.PHONY: help setup test test-quick sanitize lint format docs hooks tf2_msgs demo paper-tables colcon check-aarch64 clean
 
 help:
 	@echo 'make setup           create $(VENV), build the native code and install the package (PYTHON=python3.11 chooses the interpreter)'
 	echo 'make test-quick      run the fast tests: no ROS processes, no recordings, under 2 minutes'
 	echo 'make test            run every test, $(TEST_WORKERS) at a time (TEST_WORKERS=4 changes that)'
+	echo 'make sanitize        run the native code'"'"'s tests with the address and undefined-behaviour sanitizers of g++'
 	echo 'make lint            check style, types and spelling: ruff, mypy, codespell, clang-format'
 	echo 'make format          rewrite Python and C++ files in the project'"'"'s format'
 	echo 'make docs            build the documentation site in build/site and check its links'
@@ -68,6 +69,18 @@ test: setup tf2_msgs
 
 test-quick: setup
 	@$(BIN)/python -m pytest -q -n $(TEST_WORKERS) --dist worksteal -m 'not slow and not ros and not recording'
+
+# A second build of the native code, in build/sanitize; test/conftest.py loads it in place of the first.
+SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=undefined -fno-omit-frame-pointer -O1 -g
+SANITIZED_TESTS := test/core/test_native_bindings.py test/core/test_rasterizer_contract.py test/core/test_torch_aligner.py \
+	test/core/test_anisotropic.py test/core/test_finite.py test/core/test_map.py
+sanitize: setup
+	@SPLATAM_CXXFLAGS='$(SANITIZERS)' $(BIN)/python setup.py --quiet build_ext --force --build-lib build/sanitize --build-temp build/sanitize/objects
+	preload=
+	for library in asan ubsan stdc++; do preload+="$$(g++ -print-file-name=lib$$library.so) "; done
+	export ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1
+	SPLATAM_NATIVE=$$(find build/sanitize -name '_native*.so') LD_PRELOAD=$$preload \
+		$(BIN)/python -m pytest -q -p no:cacheprovider $(SANITIZED_TESTS)
 
 # Runs every check, also after one has failed, and names those that failed.
 lint: setup $(VENV)/.docs

@@ -32,6 +32,7 @@ COMPILE_FLAGS = [
     '-std=c++17', '-O3', '-g0', '-fno-math-errno', '-fno-trapping-math', '-fvisibility=hidden', '-pthread',
     '-Wno-psabi',
 ]  # fmt: skip
+MORE_FLAGS = shlex.split(os.environ.get('SPLATAM_CXXFLAGS', ''))  # of the compiler and the linker; `make sanitize` sets them
 
 
 def pybind11_include_dirs() -> list[str] | None:
@@ -66,7 +67,7 @@ class BuildNative(build_ext):
         if missing := missing_for_build():
             sys.exit(f'{NAME}: {missing}')
         super().run()
-        if not self.inplace and platform.machine() in self.plat_name:  # not when cross-compiling
+        if not self.inplace and not MORE_FLAGS and platform.machine() in self.plat_name:  # not when cross-compiling
             self.copy_extensions_to_source()
 
 
@@ -77,8 +78,8 @@ def native_extension() -> Extension:
         sources=sorted(glob(f'{CSRC}/*.cpp')),
         depends=sorted(glob(f'{CSRC}/*.[hi]*')),
         include_dirs=pybind11_include_dirs() or [],
-        extra_compile_args=COMPILE_FLAGS,
-        extra_link_args=['-pthread'],
+        extra_compile_args=[*COMPILE_FLAGS, *MORE_FLAGS],
+        extra_link_args=['-pthread', *MORE_FLAGS],
         language='c++',
     )
 

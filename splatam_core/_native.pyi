@@ -1,6 +1,7 @@
 """Types of the native extension, which ``csrc/bindings.cpp`` defines.
 
-Arrays are C-contiguous. An array that a call writes to must have exactly the stated type and layout, else it is a TypeError.
+Arrays are C-contiguous and have exactly the stated type and shape, else they are a TypeError that names the argument; nothing is
+converted or copied. Only 4x4 poses may have any strides.
 """
 
 from collections.abc import Sequence
@@ -15,6 +16,9 @@ Bytes = NDArray[np.uint8]
 
 BLOCK: int
 """Gaussians per row of ``Gaussians.bounds``."""
+
+class TooLargeError(ValueError):
+    """A view that cannot be drawn: more than 32768 pixels a side, or more than 2^26 pairs of a Gaussian and a tile."""
 
 class View:
     """What ``Engine.forward`` stores for ``Engine.backward``."""

@@ -1,12 +1,15 @@
-"""Files and folders that appear complete or not at all."""
+"""Files and folders that appear complete or not at all, and reading that does not wait for a pipe."""
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
+import stat
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 
 @contextmanager
@@ -33,12 +36,31 @@ def new_folder(path: Path) -> Iterator[Path]:
         OSError: it cannot be made, or something other than an empty folder is at the path in the end.
     """
     temporary = path.with_name(f'.{path.name}.{os.getpid()}')
+    temporary.mkdir(parents=True)
     try:
-        temporary.mkdir(parents=True)
         yield temporary
         temporary.replace(path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Opens a file to read its bytes.
+
+    Raises:
+        OSError: it cannot be opened, or is a pipe, a device or a folder, of which reading may never end.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # O_NONBLOCK: do not wait for a pipe's writer
+    try:
+        mode = os.fstat(descriptor).st_mode
+        if not stat.S_ISREG(mode):
+            code = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL
+            what = os.strerror(errno.EISDIR) if stat.S_ISDIR(mode) else 'Not a regular file'
+            raise OSError(code, what, str(path))
+        return os.fdopen(descriptor, 'rb')
+    except BaseException:
+        os.close(descriptor)
+        raise
 
 
 def is_unfinished(name: str, replaceable: Collection[str]) -> bool:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from splatam_core.commands import ablations, bench, compare, convert, evaluate, export, refine, render, run
 from splatam_core.commands.shared import EXIT_ERROR, EXIT_INTERRUPTED
-from splatam_core.errors import SplatamError
+from splatam_core.errors import SplatamError, one_line
 
 COMMANDS = (
     run.COMMAND,
@@ -41,6 +41,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return args.run(args)
     except SplatamError as error:
         print(f'splatam: error: {error}', file=sys.stderr)
+        return EXIT_ERROR
+    except OSError as error:  # of the system: a path, a full disk, a closed pipe
+        where = '' if error.filename is None else f'{error.filename}: '
+        print(f'splatam: error: {where}{error.strerror or one_line(error)}', file=sys.stderr)
+        return EXIT_ERROR
+    except MemoryError:
+        print('splatam: error: the memory is full: choose a smaller --width, or --preset realtime', file=sys.stderr)
         return EXIT_ERROR
     except KeyboardInterrupt:
         print('splatam: interrupted', file=sys.stderr)

@@ -41,6 +41,7 @@ class CheckpointError(SplatamError):
     """A checkpoint that is missing, damaged, or of another run."""
 
 
-def one_line(error: Exception) -> str:
-    """What another library's error says, without its line breaks."""
-    return ' '.join(str(error).split())
+def one_line(error: Exception | str) -> str:
+    """Returns what another library's error says, without its line breaks and without more than 300 characters of them."""
+    text = ' '.join(str(error).split())
+    return text if len(text) <= 300 else text[:297] + '...'

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -59,8 +60,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _number(text: str) -> float:
     value = float(text)
-    if not value > 0:
-        raise argparse.ArgumentTypeError(f'{text} is not above 0')
+    if not 0 < value < float('inf'):
+        raise argparse.ArgumentTypeError(f'{text} is not a number above 0')
     return value
 
 
@@ -68,11 +69,12 @@ def export(args: argparse.Namespace) -> int:
     """Writes a run's map for other programs."""
     from splatam_core.maps.export import centres
     from splatam_core.maps.ply import write_ply, write_surface
+    from splatam_core.runs.layout import why_not
 
     suffix = '.npz' if args.form == 'splatam' else '.ply'
     if args.file.suffix.lower() != suffix:
         raise ExportError(f"{args.file}: '{args.file.suffix}' files are not written; name it {suffix}")
-    if args.file.exists() and not args.overwrite:
+    if os.path.lexists(args.file) and not args.overwrite:
         raise ExportError(f'{args.file} exists: choose another name, or replace it with --overwrite')
     run = open_run(args.dir, args.device)
     gaussians = run.read_map()
@@ -88,7 +90,7 @@ def export(args: argparse.Namespace) -> int:
         surface = centres(gaussians, args.min_opacity) if args.form == 'points' else _mesh(args, run, gaussians)
         write_surface(args.file, surface.points_m, surface.rgb, surface.triangles)
     except OSError as error:
-        raise ExportError(f'{args.file}: cannot be written: {error.strerror}') from None
+        raise ExportError(f'{args.file}: cannot be written: {why_not(error)}') from None
     faces = '' if surface.triangles is None else f' and {len(surface.triangles)} triangles'
     print(f'{len(surface.points_m)} points{faces} are in {args.file}')
     return 0

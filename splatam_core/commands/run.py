@@ -24,7 +24,7 @@ from splatam_core.commands.shared import (
     source_of,
     usable_ground_truth,
 )
-from splatam_core.errors import DatasetError, FrameError, RunFolderError, SplatamError
+from splatam_core.errors import FrameError, RunFolderError, SplatamError
 
 if TYPE_CHECKING:
     from splatam_core.config import SlamConfig
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from splatam_core.runs.resume import CheckpointWriter
     from splatam_core.runs.writer import RunFolder
     from splatam_core.slam import Slam
+
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -113,7 +115,7 @@ class _Outcome:
     """
 
     metrics: Metrics
-    failure: DatasetError | None
+    failure: SplatamError | None
     stopped: str
 
 
@@ -131,6 +133,8 @@ def _begin(args: argparse.Namespace) -> _Job:
     sequence, slam = prepare(open_source(source), config)
     truth = _checked_ground_truth(sequence, args)
     _say_backend(slam)
+    if not args.no_evaluate:
+        _check_truth(sequence)
     every, keep = args.checkpoint_every, args.keep_checkpoints or KEEP_CHECKPOINTS
     description = RunDescription('splatam run', args.preset, source, every, keep)
     folder = RunFolder.create(args.out, config, description, overwrite=args.overwrite)
@@ -164,6 +168,14 @@ def _checked_ground_truth(sequence: FrameSequence, args: argparse.Namespace) -> 
     return None if args.no_evaluate else usable_ground_truth(sequence)
 
 
+def _check_truth(sequence: FrameSequence) -> None:
+    """Says before the run what is wrong with the ground truth; it costs the trajectory error, and nothing else."""
+    try:
+        sequence.ground_truth()
+    except SplatamError as error:
+        say(f'there will be no trajectory error: {error}')
+
+
 def _say_backend(slam: Slam) -> None:
     if slam.backend.why:
         say(str(slam.backend))
@@ -186,10 +198,10 @@ def _resume_hint(path: Path) -> str:
 
 
 class _StopRequest:
-    """Turns Ctrl-C into a request to stop after the frame or step at hand; a second Ctrl-C interrupts at once.
+    """Turns Ctrl-C or SIGTERM into a request to stop after the frame or step at hand; the next of them interrupts at once.
 
     Attributes:
-        requested: True once Ctrl-C was pressed.
+        requested: True once Ctrl-C was pressed or SIGTERM arrived.
         when: when the run will stop, for the user.
     """
 
@@ -198,15 +210,17 @@ class _StopRequest:
         self.when = 'after this frame'
 
     def __enter__(self) -> _StopRequest:
-        self._previous = signal.signal(signal.SIGINT, self._request)
+        self._previous = {number: signal.signal(number, self._request) for number in STOP_SIGNALS}
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        signal.signal(signal.SIGINT, self._previous)
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
 
     def _request(self, number: int, frame: FrameType | None) -> None:
         self.requested = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for each in STOP_SIGNALS:
+            signal.signal(each, signal.default_int_handler)
         say(f'stopping {self.when}; Ctrl-C again stops at once, without saving the map')
 
 
@@ -216,6 +230,8 @@ def _process_and_save(job: _Job) -> _Outcome:
     Raises:
         RunFolderError: the folder cannot be written.
     """
+    from splatam_core.runs.layout import why_not
+
     path, length = job.folder.path, len(job.sequence)
     try:
         with job.folder, _StopRequest() as stop:
@@ -226,12 +242,12 @@ def _process_and_save(job: _Job) -> _Outcome:
             finish_s = _finish(job, stop) if is_whole else 0.0
             metrics = job.folder.finish(job.slam, finish_s)
     except OSError as error:
-        raise RunFolderError(f'{path}: cannot be written: {error.strerror}; free some space{_resume_hint(path)}') from None
+        raise RunFolderError(f'{path}: cannot be written: {why_not(error)}; free some space{_resume_hint(path)}') from None
     where = 'during the final passes over the keyframes' if is_whole else f'after {metrics.frames} of {length} frames'
     return _Outcome(metrics, failure, where if stop.requested else '')
 
 
-def _process(job: _Job, stop: _StopRequest) -> DatasetError | None:
+def _process(job: _Job, stop: _StopRequest) -> SplatamError | None:
     """Processes frame after frame, to the end or to a stop request. Returns the error that ended the recording, if any."""
     from tqdm import tqdm
 
@@ -249,7 +265,7 @@ def _process(job: _Job, stop: _StopRequest) -> DatasetError | None:
             except FrameError as error:
                 say(f'frame {index} is skipped: {error}')
                 continue
-            except DatasetError as error:
+            except SplatamError as error:  # the recording ends here, or a view is too large: what was mapped is saved
                 return error
             job.folder.append(frame, result, time.perf_counter() - decoded_s, decoded_s - started_s)
             job.checkpoints.after_frame(index, frame, job.slam)

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 BAG_SUFFIXES = ('.db3', '.mcap', '.bag')
 EXIT_ERROR = 2
+MAX_NUMBER = 10**9
+"""Of a whole number on the command line."""
+
 EXIT_INTERRUPTED = 130
 
 
@@ -205,6 +208,8 @@ def positive(text: str) -> int:
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f'{value} is not at least 1')
+    if value > MAX_NUMBER:
+        raise argparse.ArgumentTypeError(f'{value} is more than {MAX_NUMBER}')
     return value
 
 

@@ -1,29 +1,43 @@
 // The engine and the aligner as Python sees them (splatam_core/_native.pyi): numpy arrays in, numpy arrays out, no
-// copies of what is written to, the GIL released.
+// copies, the GIL released.
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
-#include <optional>
+#include <algorithm>
 
 #include "aligner.hpp"
+#include "arrays.hpp"
 #include "blender_bindings.hpp"
 #include "engine.hpp"
 
 namespace py = pybind11;
 using Array = py::array_t<float, py::array::c_style>;
-using ByteArray = py::array_t<std::uint8_t, py::array::c_style>;
 
 namespace splatam {
 namespace {
 
-// Intrinsics of a PinholeCamera, and the size of the image it is used for.
-Camera camera_of(const py::object& camera, py::ssize_t width, py::ssize_t height) {
-  const auto intrinsic = [&](const char* name) { return camera.attr(name).cast<float>(); };
-  return {int(width), int(height), intrinsic("fx"), intrinsic("fy"), intrinsic("cx"), intrinsic("cy")};
+struct Size {
+  py::ssize_t width, height;
+};
+
+// Returns the size of an image [H, W].
+Size size_of(const py::handle& image, const char* name) {
+  const py::array array = checked<float>(image, name, {kAny, kAny});
+  const Size size{array.shape(1), array.shape(0)};
+  if (size.width > kMaxSide || size.height > kMaxSide) check_size(kMaxSide + 1, kMaxSide + 1);
+  check_size(int(size.width), int(size.height));
+  return size;
 }
 
-Pose pose_of(const Array& T) {
+// Intrinsics of a PinholeCamera, and the size of the image it is used for.
+Camera camera_of(const py::object& camera, Size size) {
+  const auto intrinsic = [&](const char* name) { return camera.attr(name).cast<float>(); };
+  return {int(size.width), int(size.height), intrinsic("fx"), intrinsic("fy"), intrinsic("cx"), intrinsic("cy")};
+}
+
+Pose pose_of(const py::handle& given, const char* name) {
+  const py::array_t<float> T = checked<float>(given, name, {4, 4});
   Pose pose;
   for (int row = 0; row < 3; ++row) {
     for (int column = 0; column < 3; ++column) pose.R[3 * row + column] = T.at(row, column);
@@ -32,50 +46,96 @@ Pose pose_of(const Array& T) {
   return pose;
 }
 
-float* data_or_null(std::optional<Array>& array) { return array ? array->mutable_data() : nullptr; }
+py::ssize_t blocks_of(py::ssize_t count) { return (count + py::ssize_t(kBlock) - 1) / py::ssize_t(kBlock); }
 
-std::shared_ptr<View> forward(Engine& engine, const Array& means, const Array& log_scales, const Array& logit_opacities,
-                              const Array& rgb, std::optional<Array> bounds, const Array& T_cam_world,
-                              const py::object& camera, Array& image, Array& depth, Array& silhouette) {
-  const GaussianArrays gaussians{means.data(), log_scales.data(), logit_opacities.data(), rgb.data()};
-  const auto count = std::size_t(means.shape(0));
-  const Camera pinhole = camera_of(camera, depth.shape(1), depth.shape(0));
-  const Pose pose = pose_of(T_cam_world);
-  const Images images{image.mutable_data(), depth.mutable_data(), silhouette.mutable_data()};
-  const float* limits = data_or_null(bounds);
+// The Gaussians as a call is given them.
+struct GivenGaussians {
+  py::object means, log_scales, logit_opacities, rgb;
+
+  py::ssize_t count() const { return length_of(means, "means"); }
+
+  GaussianArrays read() const {
+    const py::ssize_t n = count();
+    return {values<float>(means, "means", {n, 3}), values<float>(log_scales, "log_scales", {n, 1}),
+            values<float>(logit_opacities, "logit_opacities", {n}), values<float>(rgb, "rgb", {n, 3})};
+  }
+
+  MutableGaussians write() const {
+    const py::ssize_t n = count();
+    return {written<float>(means, "means", {n, 3}), written<float>(log_scales, "log_scales", {n, 1}),
+            written<float>(logit_opacities, "logit_opacities", {n}), written<float>(rgb, "rgb", {n, 3})};
+  }
+};
+
+std::shared_ptr<View> forward(Engine& engine, const py::object& means, const py::object& log_scales,
+                              const py::object& logit_opacities, const py::object& rgb, const py::object& bounds,
+                              const py::object& T_cam_world, const py::object& camera, const py::object& image,
+                              const py::object& depth, const py::object& silhouette) {
+  const GivenGaussians given{means, log_scales, logit_opacities, rgb};
+  const GaussianArrays gaussians = given.read();
+  const auto count = std::size_t(given.count());
+  const Size size = size_of(depth, "depth");
+  const Camera pinhole = camera_of(camera, size);
+  const Pose pose = pose_of(T_cam_world, "T_cam_world");
+  const Images images{written<float>(image, "image", {3, size.height, size.width}),
+                      written<float>(depth, "depth", {size.height, size.width}),
+                      written<float>(silhouette, "silhouette", {size.height, size.width})};
+  const float* limits =
+      bounds.is_none() ? nullptr : values<float>(bounds, "bounds", {blocks_of(given.count()), kBounds});
   py::gil_scoped_release release;
   return engine.forward(gaussians, count, limits, pinhole, pose, images);
 }
 
-void backward(Engine& engine, View& view, const Array& means, const Array& log_scales, const Array& logit_opacities,
-              const Array& rgb, const std::array<Array, 3>& images, const std::array<Array, 3>& image_gradients,
-              std::optional<Array> means_gradient, std::optional<Array> log_scales_gradient,
-              std::optional<Array> logit_opacities_gradient, std::optional<Array> rgb_gradient, Array& pose_gradient) {
-  const GaussianArrays gaussians{means.data(), log_scales.data(), logit_opacities.data(), rgb.data()};
-  const ConstImages drawn{images[0].data(), images[1].data(), images[2].data()};
-  const ConstImages gradients{image_gradients[0].data(), image_gradients[1].data(), image_gradients[2].data()};
-  const MapGradients map{data_or_null(means_gradient), data_or_null(log_scales_gradient),
-                         data_or_null(logit_opacities_gradient), data_or_null(rgb_gradient)};
-  float* pose = pose_gradient.mutable_data();
+// Three images of a view: colour, depth and silhouette.
+ConstImages images_of(const std::array<py::object, 3>& images, const char* name, const Camera& camera) {
+  const py::ssize_t width = camera.width, height = camera.height;
+  const std::string names[3] = {std::string(name) + "[0]", std::string(name) + "[1]", std::string(name) + "[2]"};
+  return {values<float>(images[0], names[0].c_str(), {3, height, width}),
+          values<float>(images[1], names[1].c_str(), {height, width}),
+          values<float>(images[2], names[2].c_str(), {height, width})};
+}
+
+void backward(Engine& engine, View& view, const py::object& means, const py::object& log_scales,
+              const py::object& logit_opacities, const py::object& rgb, const std::array<py::object, 3>& images,
+              const std::array<py::object, 3>& image_gradients, const py::object& means_gradient,
+              const py::object& log_scales_gradient, const py::object& logit_opacities_gradient,
+              const py::object& rgb_gradient, const py::object& pose_gradient) {
+  const auto n = py::ssize_t(view.num_gaussians);
+  values<float>(means, "means", {n, 3});  // as many as the view was drawn of
+  const GaussianArrays gaussians = GivenGaussians{means, log_scales, logit_opacities, rgb}.read();
+  const ConstImages drawn = images_of(images, "images", view.camera);
+  const ConstImages gradients = images_of(image_gradients, "image_gradients", view.camera);
+  const MapGradients map{written_or_null<float>(means_gradient, "means_gradient", {n, 3}),
+                         written_or_null<float>(log_scales_gradient, "log_scales_gradient", {n, 1}),
+                         written_or_null<float>(logit_opacities_gradient, "logit_opacities_gradient", {n}),
+                         written_or_null<float>(rgb_gradient, "rgb_gradient", {n, 3})};
+  float* pose = written<float>(pose_gradient, "pose_gradient", {4, 4});
   py::gil_scoped_release release;
   engine.backward(view, gaussians, drawn, gradients, map, pose);
 }
 
-double fit(Engine& engine, Array& means, Array& log_scales, Array& logit_opacities, Array& rgb,
-           std::optional<Array> bounds, Array& moments, ByteArray& steps, const std::array<float, 4>& rates,
-           const Array& T_cam_world, const py::object& camera, const ByteArray& target_rgb, const Array& target_depth,
-           float color_weight, float depth_weight, float color_limit, float depth_limit) {
-  const MutableGaussians gaussians{means.mutable_data(), log_scales.mutable_data(), logit_opacities.mutable_data(),
-                                   rgb.mutable_data()};
-  const auto count = std::size_t(means.shape(0));
-  const Camera pinhole = camera_of(camera, target_depth.shape(1), target_depth.shape(0));
-  const Pose pose = pose_of(T_cam_world);
-  const AdamState adam{moments.mutable_data(), steps.mutable_data()};
+double fit(Engine& engine, const py::object& means, const py::object& log_scales, const py::object& logit_opacities,
+           const py::object& rgb, const py::object& bounds, const py::object& moments, const py::object& steps,
+           const std::array<float, 4>& rates, const py::object& T_cam_world, const py::object& camera,
+           const py::object& target_rgb, const py::object& target_depth, float color_weight, float depth_weight,
+           float color_limit, float depth_limit) {
+  const GivenGaussians given{means, log_scales, logit_opacities, rgb};
+  const MutableGaussians gaussians = given.write();
+  const py::ssize_t n = given.count();
+  const Size size = size_of(target_depth, "target_depth");
+  const Camera pinhole = camera_of(camera, size);
+  const Pose pose = pose_of(T_cam_world, "T_cam_world");
+  const AdamState adam{written<float>(moments, "moments", {n, 16}), written<std::uint8_t>(steps, "steps", {n})};
   const AdamRates step_sizes{rates[0], rates[1], rates[2], rates[3]};
-  const Target target{target_rgb.data(), target_depth.data(), color_weight, depth_weight, color_limit, depth_limit};
-  float* limits = data_or_null(bounds);
+  const Target target{values<std::uint8_t>(target_rgb, "target_rgb", {size.height, size.width, 3}),
+                      values<float>(target_depth, "target_depth", {size.height, size.width}),
+                      color_weight,
+                      depth_weight,
+                      color_limit,
+                      depth_limit};
+  float* limits = written_or_null<float>(bounds, "bounds", {blocks_of(n), kBounds});
   py::gil_scoped_release release;
-  return engine.fit(gaussians, count, limits, adam, step_sizes, pinhole, pose, target);
+  return engine.fit(gaussians, std::size_t(n), limits, adam, step_sizes, pinhole, pose, target);
 }
 
 // Aligner::Result as Python sees it.
@@ -95,21 +155,35 @@ py::array_t<double> symmetric(const double* triangle) {
   return whole;
 }
 
-LinearSystem linearize(Aligner& aligner, const Array& brightness, const Array& depth, const Array& layers,
-                       const py::object& camera, const Array& color_motion, const Array& depth_motion,
-                       const Array& velocity, float gain, float bias, float photometric_scale, float depth_scale,
-                       float max_depth_ratio, float inlier_color, float inlier_depth) {
-  const Camera pinhole = camera_of(camera, brightness.shape(1), brightness.shape(0));
-  const float* v = velocity.data();
+// Images [H, W] of a level, and their size.
+struct GivenLevel {
+  Size size;
+  const float *brightness, *depth;
+};
+
+GivenLevel level_of(const py::object& brightness, const py::object& depth) {
+  const Size size = size_of(brightness, "brightness");
+  return {size, values<float>(brightness, "brightness", {size.height, size.width}),
+          values<float>(depth, "depth", {size.height, size.width})};
+}
+
+LinearSystem linearize(Aligner& aligner, const py::object& brightness, const py::object& depth,
+                       const py::object& layers, const py::object& camera, const py::object& color_motion,
+                       const py::object& depth_motion, const py::object& velocity, float gain, float bias,
+                       float photometric_scale, float depth_scale, float max_depth_ratio, float inlier_color,
+                       float inlier_depth) {
+  const GivenLevel level = level_of(brightness, depth);
+  const float* frame = values<float>(layers, "layers", {level.size.height, level.size.width, kLayers});
+  const Camera pinhole = camera_of(camera, level.size);
+  const float* v = values<float>(velocity, "velocity", {6});
   const AlignmentSettings settings{
       gain,         bias,        {v[0], v[1], v[2], v[3], v[4], v[5]}, photometric_scale, depth_scale, max_depth_ratio,
       inlier_color, inlier_depth};
-  const Pose color_pose = pose_of(color_motion), depth_pose = pose_of(depth_motion);
+  const Pose color_pose = pose_of(color_motion, "color_motion"), depth_pose = pose_of(depth_motion, "depth_motion");
   Aligner::Result result;
   {
     py::gil_scoped_release release;
-    result =
-        aligner.linearize(brightness.data(), depth.data(), pinhole, layers.data(), color_pose, depth_pose, settings);
+    result = aligner.linearize(level.brightness, level.depth, pinhole, frame, color_pose, depth_pose, settings);
   }
   const auto& sums = result.sums;
   return {symmetric(sums.H),  py::array_t<double>(kUnknowns, sums.g),
@@ -119,49 +193,48 @@ LinearSystem linearize(Aligner& aligner, const Array& brightness, const Array& d
           result.depth_median};
 }
 
-py::tuple halve(Aligner& aligner, const Array& brightness, const Array& depth, float max_step) {
-  const int width = int(brightness.shape(1)), height = int(brightness.shape(0));
+py::tuple halve(Aligner& aligner, const py::object& brightness, const py::object& depth, float max_step) {
+  const GivenLevel level = level_of(brightness, depth);
+  const int width = int(level.size.width), height = int(level.size.height);
   Array half_brightness({height / 2, width / 2}), half_depth({height / 2, width / 2});
-  aligner.halve(brightness.data(), depth.data(), width, height, max_step, half_brightness.mutable_data(),
+  aligner.halve(level.brightness, level.depth, width, height, max_step, half_brightness.mutable_data(),
                 half_depth.mutable_data());
   return py::make_tuple(half_brightness, half_depth);
 }
 
-Array fill_holes(Aligner& aligner, const Array& depth, int max_gap, float max_step) {
-  const int width = int(depth.shape(1)), height = int(depth.shape(0));
-  Array result({height, width});
-  std::copy(depth.data(), depth.data() + depth.size(), result.mutable_data());
-  aligner.fill_holes(result.mutable_data(), width, height, max_gap, max_step);
+Array fill_holes(Aligner& aligner, const py::object& depth, int max_gap, float max_step) {
+  const Size size = size_of(depth, "depth");
+  const float* readings = values<float>(depth, "depth", {size.height, size.width});
+  Array result({size.height, size.width});
+  std::copy(readings, readings + result.size(), result.mutable_data());
+  aligner.fill_holes(result.mutable_data(), int(size.width), int(size.height), max_gap, max_step);
   return result;
 }
 
-Array layers(Aligner& aligner, const Array& brightness, const Array& depth, float max_step) {
-  const int width = int(brightness.shape(1)), height = int(brightness.shape(0));
+Array layers(Aligner& aligner, const py::object& brightness, const py::object& depth, float max_step) {
+  const GivenLevel level = level_of(brightness, depth);
+  const int width = int(level.size.width), height = int(level.size.height);
   Array result({height, width, kLayers});
-  aligner.layers(brightness.data(), depth.data(), width, height, max_step, result.mutable_data());
+  aligner.layers(level.brightness, level.depth, width, height, max_step, result.mutable_data());
   return result;
 }
 
 void bind_engine(py::module_& module) {
-  // Arrays that are written to are marked noconvert: of another type or layout they are a TypeError, since pybind11
-  // would pass a copy instead.
   py::class_<View, std::shared_ptr<View>>(module, "View");
   py::class_<Engine, std::shared_ptr<Engine>>(module, "Engine")
-      .def(py::init([](int threads) { return std::make_shared<Engine>(threads); }), py::arg("threads"))
+      .def(py::init([](int threads) { return std::make_shared<Engine>(checked_threads(threads)); }), py::arg("threads"))
       .def_property_readonly("instruction_set", &Engine::instruction_set)
       .def("forward", &forward, py::kw_only(), py::arg("means"), py::arg("log_scales"), py::arg("logit_opacities"),
-           py::arg("rgb"), py::arg("bounds"), py::arg("T_cam_world"), py::arg("camera"), py::arg("image").noconvert(),
-           py::arg("depth").noconvert(), py::arg("silhouette").noconvert())
+           py::arg("rgb"), py::arg("bounds"), py::arg("T_cam_world"), py::arg("camera"), py::arg("image"),
+           py::arg("depth"), py::arg("silhouette"))
       .def("backward", &backward, py::arg("view"), py::kw_only(), py::arg("means"), py::arg("log_scales"),
            py::arg("logit_opacities"), py::arg("rgb"), py::arg("images"), py::arg("image_gradients"),
-           py::arg("means_gradient").noconvert(), py::arg("log_scales_gradient").noconvert(),
-           py::arg("logit_opacities_gradient").noconvert(), py::arg("rgb_gradient").noconvert(),
-           py::arg("pose_gradient").noconvert())
-      .def("fit", &fit, py::kw_only(), py::arg("means").noconvert(), py::arg("log_scales").noconvert(),
-           py::arg("logit_opacities").noconvert(), py::arg("rgb").noconvert(), py::arg("bounds").noconvert(),
-           py::arg("moments").noconvert(), py::arg("steps").noconvert(), py::arg("rates"), py::arg("T_cam_world"),
-           py::arg("camera"), py::arg("target_rgb"), py::arg("target_depth"), py::arg("color_weight"),
-           py::arg("depth_weight"), py::arg("color_limit"), py::arg("depth_limit"));
+           py::arg("means_gradient"), py::arg("log_scales_gradient"), py::arg("logit_opacities_gradient"),
+           py::arg("rgb_gradient"), py::arg("pose_gradient"))
+      .def("fit", &fit, py::kw_only(), py::arg("means"), py::arg("log_scales"), py::arg("logit_opacities"),
+           py::arg("rgb"), py::arg("bounds"), py::arg("moments"), py::arg("steps"), py::arg("rates"),
+           py::arg("T_cam_world"), py::arg("camera"), py::arg("target_rgb"), py::arg("target_depth"),
+           py::arg("color_weight"), py::arg("depth_weight"), py::arg("color_limit"), py::arg("depth_limit"));
 }
 
 void bind_aligner(py::module_& module) {
@@ -176,7 +249,8 @@ void bind_aligner(py::module_& module) {
       .def_readonly("photometric_median", &LinearSystem::photometric_median)
       .def_readonly("depth_median", &LinearSystem::depth_median);
   py::class_<Aligner>(module, "Aligner")
-      .def(py::init<int>(), py::arg("threads"))
+      .def(py::init([](int threads) { return std::make_unique<Aligner>(checked_threads(threads)); }),
+           py::arg("threads"))
       .def("linearize", &linearize, py::arg("brightness"), py::arg("depth"), py::arg("layers"), py::kw_only(),
            py::arg("camera"), py::arg("color_motion"), py::arg("depth_motion"), py::arg("velocity"), py::arg("gain"),
            py::arg("bias"), py::arg("photometric_scale"), py::arg("depth_scale"), py::arg("max_depth_ratio"),
@@ -193,6 +267,7 @@ PYBIND11_MODULE(_native, module) {
   using namespace splatam;
   module.doc() = "The CPU rasterizer's and the alignment's kernels.";
   module.attr("BLOCK") = kBlock;
+  py::register_exception<TooLarge>(module, "TooLargeError", PyExc_ValueError);
   bind_engine(module);
   bind_aligner(module);
   bind_blender(module);

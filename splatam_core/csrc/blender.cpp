@@ -4,6 +4,8 @@
 #include <array>
 #include <cmath>
 
+#include "engine.hpp"
+
 namespace splatam {
 namespace {
 
@@ -29,8 +31,9 @@ Box box_of(const float* shape, int width, int height) {
 }
 
 std::shared_ptr<TileLists> list(const float* shapes, std::size_t count, int width, int height) {
+  check_size(width, height);
   auto lists = std::make_shared<TileLists>();
-  lists->width = width, lists->height = height;
+  lists->width = width, lists->height = height, lists->count = count;
   lists->tiles_x = (width + kTileSize - 1) / kTileSize, lists->tiles_y = (height + kTileSize - 1) / kTileSize;
   std::vector<Box> boxes(count);
   for (std::size_t i = 0; i < count; ++i) boxes[i] = box_of(shapes + kShape * i, width, height);
@@ -45,6 +48,7 @@ std::shared_ptr<TileLists> list(const float* shapes, std::size_t count, int widt
   begins.assign(std::size_t(lists->tiles_x) * lists->tiles_y + 1, 0);
   for_each_tile([&](std::size_t, int tile) { ++begins[tile + 1]; });
   for (std::size_t tile = 1; tile < begins.size(); ++tile) begins[tile] += begins[tile - 1];
+  check_entries(count, begins.back(), width, height);
   lists->entries.resize(begins.back());
   auto next = begins;
   for_each_tile([&](std::size_t i, int tile) { lists->entries[next[tile]++] = std::uint32_t(i); });

@@ -18,6 +18,7 @@ constexpr int kChannels = 5;  // of the image: the features and the silhouette
 // The ellipses that may touch each tile, front to back.
 struct TileLists {
   int width = 0, height = 0, tiles_x = 0, tiles_y = 0;
+  std::size_t count = 0;            // of the ellipses
   std::vector<std::size_t> begins;  // tiles + 1
   std::vector<std::uint32_t> entries;
 };

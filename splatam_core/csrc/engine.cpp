@@ -4,6 +4,8 @@
 #include <array>
 #include <cmath>
 #include <cstring>
+#include <limits>
+#include <string>
 #include <utility>
 
 namespace splatam {
@@ -59,6 +61,19 @@ void visit_tiles(const TileRect& rect, int tiles_x, Visit&& visit) {
 
 }  // namespace
 
+void check_size(int width, int height) {
+  if (width < 1 || height < 1 || width > kMaxSide || height > kMaxSide)
+    throw TooLarge("an image of " + std::to_string(width) + "x" + std::to_string(height) +
+                   " pixels cannot be drawn: expected 1 to " + std::to_string(kMaxSide) + " a side");
+}
+
+void check_entries(std::size_t count, std::size_t entries, int width, int height) {
+  if (entries > kMaxEntries)
+    throw TooLarge(std::to_string(count) + " Gaussians cover " + std::to_string(entries) + " tiles of 8x8 pixels in " +
+                   std::to_string(width) + "x" + std::to_string(height) + " pixels, at most " +
+                   std::to_string(kMaxEntries) + " can be drawn: draw smaller images, or a map of smaller Gaussians");
+}
+
 TileList View::tile(int index) const {
   const std::size_t begin = tile_begins[index];
   return {index % tiles_x * kTile, index / tiles_x * kTile, entries.data() + begin, tile_begins[index + 1] - begin};
@@ -76,8 +91,12 @@ std::shared_ptr<View> Engine::borrow_view() {
   if (!view) view = std::make_unique<View>();
   auto engine = shared_from_this();
   return std::shared_ptr<View>(view.release(), [engine](View* returned) {
+    std::unique_ptr<View> owned(returned);
     std::lock_guard<std::mutex> lock(engine->spare_mutex_);
-    engine->spare_.emplace_back(returned);
+    try {
+      engine->spare_.push_back(std::move(owned));
+    } catch (const std::bad_alloc&) {  // a deleter must not throw; the view is freed
+    }
   });
 }
 
@@ -91,6 +110,9 @@ std::shared_ptr<View> Engine::forward(const GaussianArrays& gaussians, std::size
 
 std::shared_ptr<View> Engine::list(const GaussianArrays& gaussians, std::size_t count, const float* bounds,
                                    const Camera& camera, const Pose& pose) {
+  check_size(camera.width, camera.height);
+  if (count > std::numeric_limits<std::uint32_t>::max())
+    throw TooLarge(std::to_string(count) + " Gaussians cannot be drawn: expected less than 2^32");
   auto view = borrow_view();
   view->camera = camera;
   view->pose = pose;
@@ -170,6 +192,9 @@ void Engine::list_tiles(View& view) {
       visit_tiles(rect, view.tiles_x, [counts](int tile) { ++counts[tile]; });
     }
   });
+  std::size_t entries = 0;
+  for (const std::uint32_t count : places) entries += count;
+  check_entries(visible, entries, view.camera.width, view.camera.height);
   view.tile_begins.resize(tiles + 1);
   std::uint32_t place = 0;
   for (std::size_t tile = 0; tile < tiles; ++tile) {

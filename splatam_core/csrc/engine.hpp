@@ -3,6 +3,7 @@
 
 #include <memory>
 #include <mutex>
+#include <stdexcept>
 #include <vector>
 
 #include "kernels.hpp"
@@ -12,6 +13,17 @@ namespace splatam {
 
 constexpr std::size_t kBlock = 1024;  // Gaussians per block; a block is projected or skipped as a whole
 constexpr int kBounds = 7;            // floats per block: smallest mean (3), largest mean (3), largest log scale
+
+// A view that cannot be drawn: what it would need and what is allowed.
+struct TooLarge : std::length_error {
+  using std::length_error::length_error;
+};
+
+// Throws TooLarge unless an image has 1 to kMaxSide pixels a side, so that its tiles fit into a TileRect.
+void check_size(int width, int height);
+
+// Throws TooLarge if the tiles of an image have more than kMaxEntries entries.
+void check_entries(std::size_t count, std::size_t entries, int width, int height);
 
 // What a forward pass stores for its backward pass. Projected Gaussians are stored in blocks of kBlock, with gaps.
 struct View {

@@ -34,6 +34,13 @@ struct TileRect {
   std::uint16_t x0, y0, x1, y1 : 12, missed_corners : 4;
 };
 constexpr int kMaxTiles = 1 << 12;  // per side
+constexpr int kMaxSide = kMaxTiles * kTile;
+
+// Entries of all tile lists of a view, 4 bytes each. A map of a million Gaussians that cover 60 tiles each is below it.
+constexpr std::size_t kMaxEntries = std::size_t(1) << 26;
+
+// Values beyond this, and those that are not finite, are no Gaussian's: it is not drawn, and a step there is not taken.
+constexpr float kHuge = 1e30f;
 
 // Sums over pixels of dL/d(log alpha) times 1, dx, dy, d^2, and of dL/d(r, g, b, z).
 struct SplatGradient {

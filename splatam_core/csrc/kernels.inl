@@ -1,5 +1,7 @@
 // Included once per instruction set, inside a namespace and a target region, after lanes.inl.
 
+static inline bool is_usable(float x) { return x > -kHuge && x < kHuge; }  // false for NaN
+
 static inline float clamp(float x, float low, float high) { return x < low ? low : x > high ? high : x; }
 
 static inline TileRect touched_tiles(float u, float v, float extent, const Camera& camera) {
@@ -47,12 +49,15 @@ static std::size_t project(const GaussianArrays& gaussians, const Camera& camera
     const Lanes variance = sigma * sigma + kBlur;
     const Lanes opacity = 1.0f / (1.0f + exp(min(-logit, splat(80.0f))));
     const Lanes extent = sqrt(max(2.0f * variance * log_bound(255.0f * opacity), Lanes{}));
-    const IntLanes drawn = (cam_z > kNear) & (opacity >= kMinAlpha) & (u + extent >= 0.0f) &
+    // Comparisons with NaN are false, so that what is not finite is not drawn.
+    const IntLanes drawn = (cam_z > kNear) & (cam_z < kHuge) & (absolute(log_scale) < kHuge) &
+                           (absolute(logit) < kHuge) & (opacity >= kMinAlpha) & (u + extent >= 0.0f) &
                            (u - extent <= float(camera.width - 1)) & (v + extent >= 0.0f) &
                            (v - extent <= float(camera.height - 1));
     for (int i = 0; i < count; ++i) {
       if (!drawn[i]) continue;
       const float* rgb = gaussians.rgb + 3 * (first + i);
+      if (!(is_usable(rgb[0]) && is_usable(rgb[1]) && is_usable(rgb[2]))) continue;
       splats[visible] = {u[i], v[i], -0.5f / variance[i], opacity[i], rgb[0], rgb[1], rgb[2], cam_z[i]};
       rects[visible] = touched_tiles(u[i], v[i], extent[i], camera);
       ids[visible] = std::uint32_t(first + i);
@@ -376,10 +381,13 @@ static void update(const Splat* splats, const std::uint32_t* ids, const SplatGra
     float* moments = adam.moments + 16 * id;
     const Lanes first = kBeta1 * load(moments) + (1.0f - kBeta1) * gradient;
     const Lanes second = kBeta2 * load(moments + 8) + (1.0f - kBeta2) * gradient * gradient;
+    const int step = adam.steps[id] < 255 ? adam.steps[id] + 1 : 255;
+    const Lanes move = rate * (first / (1.0f - left1[step])) / (sqrt(second / (1.0f - left2[step])) + kEpsilon);
+    const IntLanes usable = (absolute(first) < kHuge) & (second < kHuge) & (absolute(move) < kHuge);
+    if (count(usable) < 8) continue;  // an overflow would stay in the moments for ever
     store(moments, first);
     store(moments + 8, second);
-    const int step = adam.steps[id] < 255 ? ++adam.steps[id] : 255;
-    const Lanes move = rate * (first / (1.0f - left1[step])) / (sqrt(second / (1.0f - left2[step])) + kEpsilon);
+    adam.steps[id] = std::uint8_t(step);
     float* mean = gaussians.means + 3 * id;
     float* rgb = gaussians.rgb + 3 * id;
     for (int axis = 0; axis < 3; ++axis) {

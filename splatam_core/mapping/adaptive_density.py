@@ -66,16 +66,11 @@ def clone_and_split(gaussian_map: GaussianMap, gradient: Tensor, scene_radius: f
     g = gaussian_map.gaussians.detached()
     chosen = gradient >= GRADIENT_THRESHOLD
     is_small = g.log_scales.amax(dim=1) <= math.log(SMALL * scene_radius)
-    large = _chosen(g, chosen & ~is_small)
+    large = g.chosen(chosen & ~is_small)
     children = [_scattered(large, rng) for _ in range(CHILDREN)]
-    new = joined(_chosen(g, chosen & is_small), joined(*children))
+    new = joined(g.chosen(chosen & is_small), joined(*children))
     gaussian_map.keep(~(chosen & ~is_small))
     gaussian_map.extend(new)
-
-
-def _chosen(g: Gaussians, chosen: Tensor) -> Gaussians:
-    rotations = None if g.rotations is None else g.rotations[chosen]
-    return Gaussians(g.means[chosen], g.log_scales[chosen], g.logit_opacities[chosen], g.rgb[chosen], None, rotations)
 
 
 def _scattered(g: Gaussians, rng: np.random.Generator) -> Gaussians:

@@ -35,10 +35,17 @@ def densify(
 
     with torch.no_grad():
         chosen, depth = unexplained(render(), view, config), view.depth
-        gaussian_map.append(new_gaussians(view, chosen, depth, T_cam_world, config.opacity))
+        added = gaussian_map.append(new_gaussians(view, chosen, depth, T_cam_world, config.opacity))
+        chosen = chosen.masked_scatter(chosen, added)  # without those that were refused
         for _ in range(config.bias_correction_rounds):
-            depth = depth - depth_bias(render(), view)
+            depth = corrected(depth, depth_bias(render(), view), view.depth)
             gaussian_map.replace_last(new_gaussians(view, chosen, depth, T_cam_world, config.opacity))
+
+
+def corrected(depth: Tensor, bias: Tensor, reading: Tensor) -> Tensor:
+    """Returns depth - bias [H, W], and the reading where that is no depth: beside a far surface the bias may exceed a near one."""
+    moved = depth - bias
+    return torch.where((moved > 0) & (moved < torch.inf), moved, reading)
 
 
 def depth_bias(render: Render, view: View) -> Tensor:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -15,6 +17,8 @@ from splatam_core.rasterizer import Gaussians, Moments, Rates
 from splatam_core.rasterizer.base import BETA_1, BETA_2, EPSILON, check_isotropic
 from splatam_core.rasterizer.bounds import BLOCK, block_bounds
 from splatam_core.types import MapSnapshot
+
+_log = logging.getLogger(__name__)
 
 PARAMETERS = ('means', 'log_scales', 'logit_opacities', 'rgb')
 ROTATIONS = 'rotations'  # one more parameter of anisotropic maps
@@ -33,6 +37,7 @@ class GaussianMap:
         logit_opacities: [N].
         rgb: [N, 3], nominally in [0, 1].
         rotations: [N, 4] see ``Gaussians``; None when isotropic.
+        num_refused: number of Gaussians that were not added or were dropped because a value was not finite.
     """
 
     means: Tensor
@@ -42,7 +47,7 @@ class GaussianMap:
     rotations: Tensor | None
 
     def __init__(self, anisotropic: bool = False, device: torch.device = HOST) -> None:
-        self._size = 0
+        self._size = self.num_refused = 0
         self._names = (*PARAMETERS, ROTATIONS) if anisotropic else PARAMETERS
         self._storage = {
             'means': torch.empty(0, 3), 'log_scales': torch.empty(0, 3 if anisotropic else 1),
@@ -76,32 +81,59 @@ class GaussianMap:
         """Adam moments of the fused optimizer (``Rasterizer.fit``); they live as long as their Gaussians."""
         return Moments(self._storage['first_second'][: self._size], self._storage['steps'][: self._size])
 
-    def append(self, new: Gaussians) -> None:
-        """Adds Gaussians. Ends an optimization in progress.
+    def append(self, new: Gaussians) -> Tensor:
+        """Adds Gaussians, but none that is not ``usable``. Ends an optimization in progress.
+
+        Returns:
+            [K] which of the new Gaussians were added.
 
         Raises:
             RasterizerError: the new Gaussians are anisotropic and the map is not.
         """
         new = self._of_its_kind(new)
+        added = new.usable()
+        if not added.all():
+            self.refuse(len(new) - int(added.sum()))
+            new = new.chosen(added)
         self.stop_optimization()
         old_size, self._size = self._size, self._size + len(new)
         self._reserve()
         for name in ('first_second', 'steps'):
             self._storage[name][old_size : self._size] = 0
         self._refresh_views()
-        self.replace_last(new)
+        self._put(new, old_size)
+        return added
 
     def replace_last(self, new: Gaussians) -> None:
         """Replaces the Gaussians that were added last by as many others. Nothing may have moved since then.
+
+        One that is not ``usable`` replaces none.
 
         Raises:
             RasterizerError: the new Gaussians are anisotropic and the map is not.
         """
         assert self._optimizer is None
         new, begin = self._of_its_kind(new), self._size - len(new)
+        usable = new.usable()
+        if not usable.all():
+            for name in self._names:
+                values = getattr(new, name)
+                values[~usable] = self._storage[name][begin : self._size][~usable]
+        self._put(new, begin)
+
+    def _put(self, new: Gaussians, begin: int) -> None:
         for name in self._names:
             self._storage[name][begin : self._size] = getattr(new, name)
         self._update_bounds(begin // BLOCK)
+
+    def refuse(self, count: int) -> None:
+        """Counts Gaussians that are not finite, and says so: each time their number has doubled."""
+        before, self.num_refused = self.num_refused, self.num_refused + count
+        if self.num_refused.bit_length() > before.bit_length():
+            _log.warning(
+                '%d Gaussians were not finite and are left out of the map: do depth and calibration fit the camera?',
+                self.num_refused,
+            )
 
     def keep(self, kept: Tensor) -> None:
         """Drops all Gaussians but those where ``kept`` [N] is true; these keep their gradients and moments."""
@@ -145,11 +177,11 @@ class GaussianMap:
         assert self._optimizer is not None
         rates = Rates(**{name: group['lr'] for name, group in zip(self._names, self._optimizer.param_groups)})
         states = {name: self._optimizer.state.get(getattr(self, name)) for name in self._names}
-        self.append(new)
+        added = int(self.append(new).sum())
         self.start_optimization(rates)
         for name, state in states.items():
             if state:
-                self._optimizer.state[getattr(self, name)] = {key: _padded(value, len(new)) for key, value in state.items()}
+                self._optimizer.state[getattr(self, name)] = {key: _padded(value, added) for key, value in state.items()}
 
     def set_opacities(self, opacity: float) -> None:
         """Sets every opacity to one value in (0, 1); clears the gradients and moments of the opacity logits."""
@@ -199,6 +231,8 @@ class GaussianMap:
         wanted = {name: (str(v.dtype).removeprefix('torch.'), tuple(v.shape)) for name, v in sorted(expected.items())}
         if found != wanted:
             raise ValueError(f'the map is {found}; expected {wanted}')
+        if broken := [name for name in sorted(expected) if not np.isfinite(arrays[name]).all()]:
+            raise ValueError(f'the map holds numbers in {", ".join(broken)} that are not finite')
         for name, values in expected.items():
             values.copy_(torch.from_numpy(arrays[name]))
         self._size, self._storage, self._bounds, self._optimizer = size, capacity, bounds, None

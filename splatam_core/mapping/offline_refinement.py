@@ -21,7 +21,7 @@ from splatam_core.images.view import View
 from splatam_core.mapping.adaptive_density import ScreenSpaceGradient, clone_and_split
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.loss import mapping_loss
-from splatam_core.mapping.optimizers import prunable, rates
+from splatam_core.mapping.optimizers import drop_unusable, prunable, rates
 from splatam_core.mapping.posed import PosedView
 from splatam_core.rasterizer import Gaussians, Rasterizer, Rates
 
@@ -87,6 +87,7 @@ def refine_map(
         if density is not None:
             density.after(step)
     gaussian_map.stop_optimization()
+    drop_unusable(gaussian_map)
     return gaussian_map.gaussians.detached()
 
 

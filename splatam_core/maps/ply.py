@@ -16,9 +16,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatam_core.atomic_io import replaced
-from splatam_core.errors import MapFileError
+from splatam_core.atomic_io import open_regular, replaced
+from splatam_core.errors import MapFileError, one_line
 from splatam_core.rasterizer import Gaussians
+from splatam_core.rasterizer.base import HUGE, MIN_QUATERNION
 
 SH_C0 = 0.28209479177387814
 """Value of the zeroth spherical harmonic, 1 / (2 sqrt(pi))."""
@@ -42,10 +43,19 @@ _SCALAR_TYPES = {
     'double': 'f8', 'float64': 'f8',
 }  # fmt: skip
 _MAX_HEADER_BYTES = 65536
+_LARGEST = HUGE / SH_C0
+"""Of a value in a file: a colour of ``HUGE`` is stored as this coefficient."""
 
 
 def write_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write a map. An existing file is replaced only when the new one is complete."""
+    """Write a map. An existing file is replaced only when the new one is complete.
+
+    Raises:
+        MapFileError: a Gaussian is one that ``read_ply`` would refuse; nothing is written.
+        OSError: the file cannot be written.
+    """
+    if num_broken := len(gaussians) - int(gaussians.usable().sum()):
+        raise MapFileError(f'{path}: {num_broken} of {len(gaussians)} Gaussians are not finite, so the map is not written')
     columns = _columns(gaussians)
     rows = np.zeros(len(gaussians), dtype=[(name, '<f4') for name in PROPERTIES])
     for name, column in columns.items():
@@ -115,16 +125,19 @@ def read_ply(path: Path) -> Gaussians:
             not finite, or holds anisotropic Gaussians without rotations.
     """
     try:
-        with path.open('rb') as file:
+        with open_regular(path) as file:
             header = _read_header(file)
             rows = _read_rows(file, header)
     except OSError as error:
         raise MapFileError(f'{path}: cannot be read: {error.strerror}') from None
-    except ValueError as error:
-        raise MapFileError(f'{path}: {error}') from None
+    except MemoryError:
+        raise MapFileError(f'{path}: cannot be read: it does not fit into memory') from None
+    except (ValueError, TypeError) as error:
+        raise MapFileError(f'{path}: {one_line(error)}') from None
     is_anisotropic = any((rows[SCALES[0]] != rows[other]).any() for other in SCALES[1:])
     names = [*REQUIRED, *(name for name in ROTATION if is_anisotropic and name in header.names)]
-    values = {name: rows[name].astype(np.float32) for name in names}
+    with np.errstate(over='ignore'):  # a double that does not fit becomes infinite, and is refused below
+        values = {name: rows[name].astype(np.float32) for name in names}
     _check_values(path, values)
     if is_anisotropic:
         _check_rotations(path, values)
@@ -193,9 +206,9 @@ def _read_rows(file: BinaryIO, header: _Header) -> NDArray[np.void]:
 
 
 def _check_values(path: Path, values: dict[str, NDArray[np.float32]]) -> None:
-    finite = np.all([np.isfinite(column) for column in values.values()], axis=0)
-    if not finite.all():
-        raise MapFileError(f'{path}: {int((~finite).sum())} of {len(finite)} Gaussians contain NaN or infinity')
+    usable = np.all([np.abs(column) <= _LARGEST for column in values.values()], axis=0)  # false for NaN
+    if not usable.all():
+        raise MapFileError(f'{path}: {int((~usable).sum())} of {len(usable)} Gaussians contain NaN, infinity or more than 1e30')
 
 
 def _check_rotations(path: Path, values: dict[str, NDArray[np.float32]]) -> None:
@@ -203,7 +216,7 @@ def _check_rotations(path: Path, values: dict[str, NDArray[np.float32]]) -> None
         raise MapFileError(
             f'{path}: scale_0, scale_1 and scale_2 differ, so rotations are needed, but property {", ".join(missing)} is missing'
         )
-    is_zero = ~np.any([values[name] for name in ROTATION], axis=0)
+    is_zero = ~(np.linalg.norm([values[name] for name in ROTATION], axis=0) > MIN_QUATERNION)
     if is_zero.any():
         raise MapFileError(f'{path}: {int(is_zero.sum())} of {len(is_zero)} Gaussians have a quaternion of length zero')
 

@@ -9,9 +9,11 @@ Centres at z <= 0.2 m are not drawn. The background is black. Where alpha is cla
 Anisotropic Gaussians have rotations: they are ellipsoids with three radii s, rotated by R(q) in the world. They cover the image
 with covariance ``S = J W R diag(s^2) R^T W^T J^T + 0.3 I`` px^2. W is the rotation into the camera, and J the Jacobian of the
 projection at the centre, with x/z and y/z clamped to the image and a margin of 15 % of its size. A pixel at offset d is
-covered with ``alpha = min(0.99, o exp(-d^T S^-1 d / 2))``. Everything else is as above. With three equal radii this differs
-slightly from the isotropic footprint: J stretches the variance by ``1 + tan^2`` of the angle off the axis, along that
-direction, and uses fx and fy separately.
+covered with ``alpha = min(0.99, o exp(-d^T S^-1 d / 2))``. Log scales above 10 count as 10 (above 40 in isotropic Gaussians).
+Everything else is as above. With three equal radii this differs slightly from the isotropic footprint: J stretches the variance
+by ``1 + tan^2`` of the angle off the axis, along that direction, and uses fx and fy separately.
+
+A Gaussian with a value that is not finite, or beyond 1e30, is not drawn and does not change (``Gaussians.usable``).
 """
 
 from __future__ import annotations
@@ -38,6 +40,12 @@ FIT_BETA_2 = 0.99
 
 COLOR_LIMIT, DEPTH_LIMIT_M = 0.1, 0.02
 """Of ``fit``: limits of Huber's loss, quadratic below and linear above."""
+
+HUGE = 1e30
+"""No value of a Gaussian is larger: its square would overflow, and so would the colour in a map file."""
+
+MIN_QUATERNION = 1e-12
+"""Length below which a quaternion is no rotation."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,6 +92,28 @@ class Gaussians:
             rgb=self.rgb.to(device),
             bounds=None if self.bounds is None else self.bounds.to(device),
             rotations=None if self.rotations is None else self.rotations.to(device),
+        )
+
+    def usable(self) -> Tensor:
+        """Returns [N] False where a value is not finite or beyond ``HUGE``, or a quaternion has no length."""
+        parts = self.means, self.log_scales, self.logit_opacities[:, None], self.rgb
+        usable = torch.ones(len(self), dtype=torch.bool, device=self.means.device)
+        for values in parts if self.rotations is None else (*parts, self.rotations):
+            usable &= (values.detach().abs() <= HUGE).all(dim=1)  # false for NaN
+        if self.rotations is not None:
+            usable &= self.rotations.detach().norm(dim=1) > MIN_QUATERNION
+        return usable
+
+    def only_usable(self) -> Gaussians:
+        """Returns the ``usable`` Gaussians; itself if all are."""
+        usable = self.usable()
+        return self if bool(usable.all()) else self.chosen(usable)
+
+    def chosen(self, which: Tensor) -> Gaussians:
+        """Returns the Gaussians of a mask [N], without bounds."""
+        rotations = None if self.rotations is None else self.rotations[which]
+        return Gaussians(
+            self.means[which], self.log_scales[which], self.logit_opacities[which], self.rgb[which], rotations=rotations
         )
 
     def anisotropic(self) -> Gaussians:

@@ -22,8 +22,9 @@ from splatam_core.rasterizer.base import (
     Target,
     check_isotropic,
 )
+from splatam_core.rasterizer.bounds import BLOCK
 from splatam_core.rasterizer.ewa import Ellipses, project
-from splatam_core.rasterizer.native import make_blender, make_engine
+from splatam_core.rasterizer.native import make_blender, make_engine, native_errors
 
 if TYPE_CHECKING:
     from splatam_core import _native
@@ -50,40 +51,53 @@ class CpuRasterizer:
         return self._engine.instruction_set
 
     def render(self, gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -> Render:
-        """See ``Rasterizer.render``. float32 only."""
+        """See ``Rasterizer.render``. float32 only.
+
+        Raises:
+            RasterizerError: a tensor is not what the native code takes, or the view needs more memory than is allowed.
+        """
         _check(gaussians, T_cam_world)
         if gaussians.rotations is not None:
             return self._render_ellipses(project(gaussians, camera, T_cam_world), camera)
-        images = _Splat.apply(
-            gaussians.means.contiguous(), gaussians.log_scales.contiguous(), gaussians.logit_opacities.contiguous(),
-            gaussians.rgb.contiguous(), T_cam_world, _Pass(self._engine, camera, gaussians.bounds),
-        )  # fmt: skip
+        with native_errors():
+            images = _Splat.apply(
+                gaussians.means.contiguous(), gaussians.log_scales.contiguous(), gaussians.logit_opacities.contiguous(),
+                gaussians.rgb.contiguous(), T_cam_world, _Pass(self._engine, camera, gaussians.bounds),
+            )  # fmt: skip
         return Render(*images)
 
     def _render_ellipses(self, ellipses: Ellipses, camera: PinholeCamera) -> Render:
         shapes = torch.cat([ellipses.centers, ellipses.conics, ellipses.opacities[:, None]], dim=1)
-        image = _Blend.apply(shapes.contiguous(), ellipses.features.contiguous(), self._blender, camera)
+        with native_errors():
+            image = _Blend.apply(shapes.contiguous(), ellipses.features.contiguous(), self._blender, camera)
         return Render(image[:3], image[3], image[4])
 
     def fit(self, gaussians: Gaussians, moments: Moments, rates: Rates, target: Target) -> float:
-        """See ``Rasterizer.fit``. One native call, without autograd."""
+        """See ``Rasterizer.fit``. One native call, without autograd.
+
+        Raises:
+            RasterizerError: a tensor is not what the native code takes, or the view needs more memory than is allowed.
+            TypeError: a tensor that is written to is not contiguous.
+        """
         check_isotropic(gaussians)
         _check(gaussians, target.T_cam_world)
+        _check_fit(gaussians, moments, target)
         camera, readings = target.camera, max(1, int(torch.count_nonzero(target.depth)))
-        return self._engine.fit(
-            **_arrays(gaussians),
-            moments=moments.first_second.numpy(),
-            steps=moments.steps.numpy(),
-            rates=(rates.means, rates.log_scales, rates.logit_opacities, rates.rgb),
-            T_cam_world=target.T_cam_world.numpy(),
-            camera=camera,
-            target_rgb=target.rgb8.numpy(),
-            target_depth=target.depth.numpy(),
-            color_weight=target.color_weight / (3 * camera.width * camera.height),
-            depth_weight=target.depth_weight / readings,
-            color_limit=COLOR_LIMIT,
-            depth_limit=DEPTH_LIMIT_M,
-        )
+        with native_errors():
+            return self._engine.fit(
+                **_arrays(gaussians),
+                moments=moments.first_second.numpy(),
+                steps=moments.steps.numpy(),
+                rates=(rates.means, rates.log_scales, rates.logit_opacities, rates.rgb),
+                T_cam_world=target.T_cam_world.numpy(),
+                camera=camera,
+                target_rgb=target.rgb8.contiguous().numpy(),
+                target_depth=target.depth.contiguous().numpy(),
+                color_weight=target.color_weight / (3 * camera.width * camera.height),
+                depth_weight=target.depth_weight / readings,
+                color_limit=COLOR_LIMIT,
+                depth_limit=DEPTH_LIMIT_M,
+            )
 
 
 def _arrays(gaussians: Gaussians) -> dict[str, Any]:
@@ -108,17 +122,30 @@ def _check(gaussians: Gaussians, T_cam_world: Tensor) -> None:
         RasterizerError: a tensor is not what the native code takes.
     """
     n = len(gaussians)
-    expected: dict[str, tuple[int, ...]] = {'means': (n, 3), 'log_scales': (n, 1), 'logit_opacities': (n,), 'rgb': (n, 3)}
+    expected = {'means': (n, 3), 'log_scales': (n, 1), 'logit_opacities': (n,), 'rgb': (n, 3)}
     if gaussians.rotations is not None:
         expected |= {'log_scales': (n, 3), 'rotations': (n, 4)}
-    tensors = {name: getattr(gaussians, name) for name in expected} | {'T_cam_world': T_cam_world}
-    for name, shape in (expected | {'T_cam_world': (4, 4)}).items():
-        tensor = tensors[name]
-        if tensor.shape != shape or tensor.dtype != torch.float32 or tensor.device.type != 'cpu':
-            raise RasterizerError(
-                f'{name} is {tuple(tensor.shape)} {tensor.dtype} on {tensor.device}; '
-                f'the cpu rasterizer takes {shape} float32 on cpu'
-            )
+    for name, shape in expected.items():
+        _check_tensor(name, getattr(gaussians, name), shape)
+    if gaussians.bounds is not None:
+        _check_tensor('bounds', gaussians.bounds, (-(-n // BLOCK), 7))
+    _check_tensor('T_cam_world', T_cam_world, (4, 4))
+
+
+def _check_fit(gaussians: Gaussians, moments: Moments, target: Target) -> None:
+    """Checks the state of the optimizer and the target. Raises RasterizerError as ``_check`` does."""
+    n, size = len(gaussians), (target.camera.height, target.camera.width)
+    _check_tensor('first_second', moments.first_second, (n, 16))
+    _check_tensor('steps', moments.steps, (n,), torch.uint8)
+    _check_tensor('rgb8', target.rgb8, (*size, 3), torch.uint8)
+    _check_tensor('depth', target.depth, size)
+
+
+def _check_tensor(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> None:
+    if tensor.shape != shape or tensor.dtype != dtype or tensor.device.type != 'cpu':
+        raise RasterizerError(
+            f'{name} is {tuple(tensor.shape)} {tensor.dtype} on {tensor.device}; the cpu rasterizer takes {shape} {dtype} on cpu'
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,10 +8,13 @@ import torch
 from torch import Tensor
 
 from splatam_core.geometry.camera import PinholeCamera
-from splatam_core.rasterizer.base import BLUR_PX2, NEAR_M, Gaussians
+from splatam_core.rasterizer.base import BLUR_PX2, HUGE, NEAR_M, Gaussians
 
 MARGIN = 0.15
 """Fraction of the image's size around it, beyond which the Jacobian of the projection is held constant: it would diverge."""
+
+MAX_LOG_SCALE = 10.0
+"""Log metres. The covariance of a wider Gaussian overflows near the camera; this one fills the image already."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,14 +36,18 @@ class Ellipses:
 
 def project(gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -> Ellipses:
     """Projects anisotropic Gaussians, differentiable in them and in the pose, in any precision."""
+    gaussians = gaussians.only_usable()
     assert gaussians.rotations is not None
     points = gaussians.means @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]  # [N, 3]
-    drawn = torch.nonzero((points.detach()[:, 2] > NEAR_M) & torch.isfinite(points.detach()).all(dim=1))[:, 0]
+    visible = (points.detach()[:, 2] > NEAR_M) & (points.detach().abs() <= HUGE).all(dim=1)
+    drawn = torch.nonzero(visible)[:, 0]
     drawn = drawn[torch.sort(points[drawn, 2].detach(), stable=True).indices]  # [K] front to back
     points = points[drawn]
     x, y, z = points.unbind(-1)
     centers = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=1)
-    axes = rotations(gaussians.rotations[drawn]) * gaussians.log_scales[drawn].exp()[:, None, :]  # [K, 3, 3] columns
+    axes = (
+        rotations(gaussians.rotations[drawn]) * gaussians.log_scales[drawn].clamp(max=MAX_LOG_SCALE).exp()[:, None, :]
+    )  # [K, 3, 3] columns
     jacobian = _jacobian(points, camera) @ T_cam_world[:3, :3]  # [K, 2, 3] pixels per metre in the world
     on_image = (jacobian[:, :, :, None] * axes[:, None]).sum(dim=2)  # [K, 2, 3]; bmm is far slower on such small matrices
     xx, yy = ((on_image**2).sum(dim=2) + BLUR_PX2).unbind(1)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -17,19 +19,42 @@ def make_engine(threads: int) -> _native.Engine:
     """Returns what renders and fits isotropic Gaussians. threads: 0 = one per core.
 
     Raises:
-        RasterizerError: the extension is missing or does not fit.
+        RasterizerError: the extension is missing or does not fit, or the threads cannot be started.
     """
-    return _extension().Engine(_num_threads(threads))
+    return _made('Engine', threads)
 
 
 def make_blender(threads: int) -> _native.Blender:
     """Returns what blends anisotropic Gaussians; see ``make_engine``."""
-    return _extension().Blender(_num_threads(threads))
+    return _made('Blender', threads)
 
 
 def make_native_aligner(threads: int) -> _native.Aligner:
     """Returns what aligns frames on the CPU; see ``make_engine``."""
-    return _extension().Aligner(_num_threads(threads))
+    return _made('Aligner', threads)
+
+
+@contextmanager
+def native_errors() -> Iterator[None]:
+    """Turns what the native code refuses, because a view is too large, into one line.
+
+    Raises:
+        RasterizerError: the block asked for too much.
+    """
+    try:
+        yield
+    except _extension().TooLargeError as error:
+        raise RasterizerError(str(error)) from None
+    except MemoryError:
+        raise RasterizerError('the view does not fit into memory: draw smaller images, or a smaller map') from None
+
+
+def _made(kind: str, threads: int) -> Any:
+    count = _num_threads(threads)
+    try:
+        return getattr(_extension(), kind)(count)
+    except RuntimeError as error:  # std::system_error
+        raise RasterizerError(f'{count} threads cannot be started ({error}): set threads to a smaller number') from None
 
 
 @lru_cache(maxsize=1)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
+from splatam_core.errors import RasterizerError
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.rasterizer.base import (
     BETA_1,
@@ -13,6 +16,7 @@ from splatam_core.rasterizer.base import (
     DEPTH_LIMIT_M,
     EPSILON,
     FIT_BETA_2,
+    HUGE,
     MAX_ALPHA,
     MIN_ALPHA,
     MIN_TRANSMITTANCE,
@@ -28,6 +32,8 @@ from splatam_core.rasterizer.ewa import Ellipses
 from splatam_core.rasterizer.ewa import project as project_anisotropic
 
 _MAX_CELLS = 20_000_000  # Gaussian-pixel pairs held at once
+_MAX_ROW_CELLS = 400_000_000  # of one row, which is not divided: about 10 GB
+MAX_LOG_SCALE = 40.0
 
 
 class ReferenceRasterizer:
@@ -40,6 +46,10 @@ class ReferenceRasterizer:
         z = ellipses.features[:, 3:]
         features = torch.cat([ellipses.features, torch.ones_like(z)], dim=1)  # [K, 5]
         columns = torch.arange(camera.width, dtype=z.dtype, device=z.device)
+        if len(z) * camera.width > _MAX_ROW_CELLS:
+            raise RasterizerError(
+                f'{len(z)} Gaussians at {camera.width} pixels of width are too many for rasterizer=reference; use rasterizer=cpu'
+            )
         rows_at_once = max(1, _MAX_CELLS // max(1, len(z) * camera.width))
         bands = [
             _blend(ellipses, features, columns, rows.to(z.dtype))
@@ -56,7 +66,7 @@ class ReferenceRasterizer:
         means, log_scales, logits, rgb = packed.split([3, 1, 1, 3], dim=1)
         loss = _loss(self.render(Gaussians(means, log_scales, logits[:, 0], rgb), target.camera, target.T_cam_world), target)
         (gradient,) = torch.autograd.grad(loss, packed)
-        seen = (gradient != 0).any(dim=1)
+        seen = (gradient != 0).any(dim=1) & (gradient.abs() < math.sqrt(HUGE)).all(dim=1)
         gradient = gradient[seen]
         moments.steps[seen] += (moments.steps[seen] < 255).to(torch.uint8)
         step = moments.steps[seen, None].to(gradient.dtype)
@@ -84,13 +94,15 @@ def _huber(residual: Tensor, limit: float) -> Tensor:
 
 def _project_isotropic(gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Tensor) -> Ellipses:
     """Projects isotropic Gaussians to circles, front to back."""
+    gaussians = gaussians.only_usable()
     points = gaussians.means @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]  # [N, 3]
-    drawn = torch.nonzero(points[:, 2].detach() > NEAR_M)[:, 0]
+    visible = (points[:, 2].detach() > NEAR_M) & (points.detach().abs() <= HUGE).all(dim=1)
+    drawn = torch.nonzero(visible)[:, 0]
     drawn = drawn[torch.sort(points[drawn, 2].detach(), stable=True).indices]  # [K]
     x, y, z = points[drawn].unbind(-1)
     centers = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=1)
     focal = (camera.fx + camera.fy) / 2
-    variance = (focal * gaussians.log_scales[drawn, 0].exp() / z) ** 2 + BLUR_PX2
+    variance = (focal * gaussians.log_scales[drawn, 0].clamp(max=MAX_LOG_SCALE).exp() / z) ** 2 + BLUR_PX2
     conics = torch.stack([1 / variance, torch.zeros_like(z), 1 / variance], dim=1)
     features = torch.cat([gaussians.rgb[drawn], z[:, None]], dim=1)
     return Ellipses(centers, conics, torch.sigmoid(gaussians.logit_opacities[drawn]), features)

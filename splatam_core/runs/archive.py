@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,8 +18,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
 
-from splatam_core.atomic_io import replaced
+from splatam_core.atomic_io import open_regular, replaced
 from splatam_core.errors import CheckpointError, one_line
 from splatam_core.types import Arrays
 
@@ -95,9 +98,12 @@ def read_archive(path: Path, kind: str, version: int, digest: str | None = None)
         CheckpointError: the file cannot be read, is damaged, or has another kind, version or digest.
     """
     try:
-        data = path.read_bytes()
+        with open_regular(path) as file:
+            data = file.read()
     except OSError as error:
         raise CheckpointError(f'{path}: cannot be read: {error.strerror}') from None
+    except MemoryError:
+        raise CheckpointError(f'{path}: cannot be read: it does not fit into memory') from None
     header, newline, _ = data[:_MAX_HEADER_BYTES].partition(b'\n')
     stated = _stated_digest(path, header if newline else data[:_MAX_HEADER_BYTES], kind, version)
     payload = memoryview(data)[len(header) + 1 :]
@@ -122,9 +128,34 @@ def _stated_digest(path: Path, header: bytes, kind: str, version: int) -> str:
 
 def _unpack(path: Path, payload: memoryview) -> Content:
     try:
-        with np.load(io.BytesIO(payload), allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
+        with zipfile.ZipFile(io.BytesIO(payload)) as archive:
+            _check_sizes(archive, len(payload))
+            arrays = {entry.filename.removesuffix('.npy'): _array(archive.read(entry)) for entry in archive.infolist()}
         values = json.loads(arrays.pop(_VALUES).tobytes())
-    except (ValueError, KeyError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile) as error:
+        if not isinstance(values, dict):
+            raise ValueError(f'its values are of type {type(values).__name__}')
+    except Exception as error:  # noqa: BLE001 - zip, npy and JSON raise a dozen kinds of errors over what a file may hold
         raise CheckpointError(f'{path}: holds something else than arrays of numbers: {one_line(error)}') from None
     return Content(values, arrays)
+
+
+def _check_sizes(archive: zipfile.ZipFile, available: int) -> None:
+    """Checks, before anything is unpacked, that the content is not larger than the file: ``pack`` does not compress."""
+    entries = archive.infolist()
+    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+        raise ValueError('it is compressed')
+    if (stated := sum(entry.file_size for entry in entries)) > available:
+        raise ValueError(f'its {len(entries)} arrays claim {stated} bytes of {available}')
+
+
+def _array(data: bytes) -> NDArray[Any]:
+    """Returns the array in the bytes of an npy file, which must be as long as its header says."""
+    file = io.BytesIO(data)
+    read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[npy.read_magic(file)]
+    shape, is_fortran, dtype = read_header(file)
+    if dtype.hasobject:
+        raise ValueError('objects')
+    if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != len(data) - file.tell():
+        raise ValueError(f'{shape} {dtype} do not take {len(data) - file.tell()} bytes')
+    flat = np.frombuffer(data, dtype, offset=file.tell()) if math.prod(shape) else np.empty(0, dtype)
+    return flat.reshape(shape, order='F' if is_fortran else 'C').copy(order='K')

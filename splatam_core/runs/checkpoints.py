@@ -13,27 +13,31 @@ The keyframes are written first, and each file in one step: whatever interrupts 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 
 from splatam_core.atomic_io import is_unfinished
 from splatam_core.config import SlamConfig, flat_values, with_values
-from splatam_core.errors import CheckpointError, SplatamError
+from splatam_core.errors import CheckpointError, one_line
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.images.view import View
 from splatam_core.mapping.posed import PosedView
 from splatam_core.retired_settings import migrated
 from splatam_core.runs.archive import Content, pack, read_archive
+from splatam_core.runs.layout import KEYFRAMES
 from splatam_core.state import SlamState
 from splatam_core.tracking.motion import MotionState
 from splatam_core.tracking.time_offset import TimeOffset
+from splatam_core.types import Arrays
 
 VERSION = 1
 KIND, KEYFRAME = 'checkpoint', 'keyframe'
-KEYFRAMES = 'keyframes'
 _MAP = 'map.'
 
 
@@ -114,6 +118,7 @@ class Checkpoints:
         paths = checkpoint_paths(self._folder)
         for path in paths[: -self._keep]:
             path.unlink(missing_ok=True)
+        self._needed = {path: digests for path, digests in self._needed.items() if path in paths[-self._keep :]}
         needed = {digest for path in paths[-self._keep :] for digest in self._digests_in(path)}
         for path in (self._folder / KEYFRAMES).glob(f'*.{KEYFRAME}'):
             if path.stem not in needed:
@@ -164,9 +169,9 @@ def read_checkpoint(path: Path) -> Checkpoint:
         return _from_content(path, content)
     except CheckpointError:
         raise
-    except (KeyError, TypeError, ValueError, SplatamError) as error:
+    except Exception as error:  # noqa: BLE001 - whatever a file holds, it is refused in one line
         raise CheckpointError(
-            f'{path}: is no checkpoint that this version understands: {error!r}; use the version that wrote it'
+            f'{path}: is no checkpoint that this version understands: {one_line(repr(error))}; use the version that wrote it'
         ) from None
 
 
@@ -184,6 +189,7 @@ def _to_content(state: SlamState, progress: Progress, digests: Sequence[str]) ->
 
 def _from_content(path: Path, content: Content) -> Checkpoint:
     values, arrays = content.values, content.arrays
+    _check_values(values, arrays)
     camera = None if values['camera'] is None else PinholeCamera(**values['camera'])
     stamp_ns, interval_ns = values['motion_ns']
     time_offset = TimeOffset(**values.get('time_offset', {}))  # 0.1.0 estimated it in every frame anew
@@ -201,6 +207,33 @@ def _from_content(path: Path, content: Content) -> Checkpoint:
     return Checkpoint(path, state, Progress(**values['progress']))
 
 
+def _check_values(values: Mapping[str, Any], arrays: Arrays) -> None:
+    """Checks the numbers that only later frames would trip over.
+
+    Raises:
+        KeyError: one is missing.
+        ValueError: one is not a number of its kind.
+    """
+    progress, (stamp_ns, interval_ns) = values['progress'], values['motion_ns']
+    whole = {'num_frames': values['num_frames'], 'motion_ns': stamp_ns, 'interval_ns': interval_ns}
+    whole |= {name: progress[name] for name in ('length', 'last_index', 'num_lines')}
+    if values['last_stamp_ns'] is not None:
+        whole['last_stamp_ns'] = values['last_stamp_ns']
+    if wrong := [name for name, number in whole.items() if type(number) is not int or abs(number) >= 2**63]:
+        raise ValueError(f'{wrong[0]} = {whole[wrong[0]]!r}: expected a whole number')
+    if not 0 <= progress['last_index'] < progress['length'] or progress['num_lines'] < 0:
+        raise ValueError(f'progress {progress}: the last frame is not in the recording')
+    radius = values['scene_radius']
+    if type(radius) not in (int, float) or not 0 <= radius < math.inf:
+        raise ValueError(f'scene_radius = {radius!r}: expected a length')
+    offset = values.get('time_offset', {}).values()
+    if not all(type(number) in (int, float) and math.isfinite(number) for number in offset):
+        raise ValueError(f'time_offset = {values["time_offset"]!r}: expected numbers')
+    for name in ('T_world_cam', 'velocity'):
+        if arrays[name].dtype != np.float64 or not np.isfinite(arrays[name]).all():
+            raise ValueError(f'{name} holds numbers that are not finite')
+
+
 def _read_keyframe(folder: Path, digest: str, camera: PinholeCamera | None) -> PosedView:
     path = _keyframe_path(folder, digest)
     if camera is None:
@@ -215,6 +248,8 @@ def _read_keyframe(folder: Path, digest: str, camera: PinholeCamera | None) -> P
     found = [(array.dtype.name, array.shape) for array in (rgb8, depth, T_cam_world)]
     if found != expected:
         raise CheckpointError(f'{path}: is no keyframe of this run: it holds {found}, expected {expected}')
+    if not (np.isfinite(depth).all() and np.isfinite(T_cam_world).all()):
+        raise CheckpointError(f'{path}: is no keyframe of this run: its depth or pose is not finite')
     return PosedView(View(camera, torch.from_numpy(rgb8), torch.from_numpy(depth)), torch.from_numpy(T_cam_world))
 
 

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import csv
+import logging
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from splatam_core.geometry.trajectory import pose_line, stamp_from_text, stamp_text
+from splatam_core.atomic_io import open_regular
+from splatam_core.errors import one_line
+from splatam_core.geometry.trajectory import Trajectory, pose_line, stamp_from_text, stamp_text, trajectory_from_rows
 from splatam_core.types import FrameResult, StageTimings, Status
+
+_log = logging.getLogger(__name__)
 
 STAGES = tuple(entry.name for entry in fields(StageTimings))
 LOST = '# lost '
@@ -86,15 +93,52 @@ def trajectory_line(result: FrameResult) -> str:
     return pose_line(result.stamp_ns, result.T_world_cam)
 
 
-def read_lost(path: Path) -> tuple[int, ...]:
-    """Returns the stamps (ns) of the lost frames in a ``trajectory.txt``.
+def complete_lines(path: Path) -> list[str]:
+    """Returns the lines of a file that is written line by line. A last line that a crash cut off is left out, with a warning.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: a stamp is no number.
+        ValueError: it is no text.
     """
-    lines = path.read_text().splitlines()
-    return tuple(stamp_from_text(line.removeprefix(LOST)) for line in lines if line.startswith(LOST))
+    with open_regular(path) as file:
+        text = file.read().decode('utf-8')
+    whole = text.rstrip('\0')  # after a power cut a file may end in zeros
+    end = whole.rfind('\n') + 1
+    if end < len(text):
+        _log.warning('%s: its last line is incomplete and left out: was the writer stopped by force?', path)
+    return whole[:end].split('\n')[:-1]
+
+
+def read_poses(lines: Iterable[str], name: str) -> Trajectory:
+    """Returns the poses in the lines of a ``trajectory.txt``.
+
+    Raises:
+        DatasetError: the stamps do not increase.
+        ValueError: a line is no pose.
+    """
+    rows = []
+    for number, line in enumerate(lines, 1):
+        if line.strip() and not line.lstrip().startswith('#'):
+            try:
+                stamp, *values = line.split()
+                row = _stamp(stamp), [_number(value) for value in values]
+                if len(row[1]) != 7 or not any(row[1][3:]):
+                    raise ValueError
+            except ValueError:
+                raise ValueError(
+                    f"{name}:{number}: expected 'stamp tx ty tz qx qy qz qw' with a non-zero quaternion, got '{one_line(line)}'"
+                ) from None
+            rows.append(row)
+    return trajectory_from_rows(rows, name)
+
+
+def read_lost(lines: Iterable[str]) -> tuple[int, ...]:
+    """Returns the stamps (ns) of the lost frames in the lines of a ``trajectory.txt``.
+
+    Raises:
+        ValueError: a stamp is no number of seconds.
+    """
+    return tuple(_stamp(line.removeprefix(LOST)) for line in lines if line.startswith(LOST))
 
 
 def read_frame_records(path: Path) -> tuple[FrameRecord, ...]:
@@ -102,24 +146,38 @@ def read_frame_records(path: Path) -> tuple[FrameRecord, ...]:
 
     Raises:
         OSError: the file cannot be read.
-        KeyError, TypeError, ValueError: a column is missing, or a cell has no value of its column.
+        csv.Error, KeyError, TypeError, ValueError: a column is missing, or a cell has no value of its column.
     """
     if not path.exists():
         return ()
-    with path.open(newline='') as file:
-        return tuple(_frame_record(row) for row in csv.DictReader(file))
+    lines = (f'{line}\n' for line in complete_lines(path))
+    return tuple(_frame_record(row) for row in csv.DictReader(lines))
+
+
+def _stamp(text: str) -> int:
+    stamp_ns = stamp_from_text(text)
+    if abs(stamp_ns) >= 2**63:
+        raise ValueError(f"'{text}' is no stamp: its nanoseconds need more than 64 bits")
+    return stamp_ns
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"'{text}' is not finite")
+    return value
 
 
 def _frame_record(row: dict[str, str]) -> FrameRecord:
     return FrameRecord(
-        stamp_ns=stamp_from_text(row['stamp']),
+        stamp_ns=_stamp(row['stamp']),
         status=Status(row['status']),
         is_keyframe=row['is_keyframe'] == '1',
         num_gaussians=int(row['num_gaussians']),
-        visible_fraction=float(row.get('visible_fraction') or row['sure_fraction']),  # the column's name in 0.1.0
-        inlier_fraction=float(row['inlier_fraction']),
-        process_ms=float(row['process_ms']),
-        decode_ms=float(row['decode_ms']) if row['decode_ms'] else None,
-        timings=StageTimings(*(float(row[f'{stage}_ms']) for stage in STAGES)),
+        visible_fraction=_number(row.get('visible_fraction') or row['sure_fraction']),  # the column's name in 0.1.0
+        inlier_fraction=_number(row['inlier_fraction']),
+        process_ms=_number(row['process_ms']),
+        decode_ms=_number(row['decode_ms']) if row['decode_ms'] else None,
+        timings=StageTimings(*(_number(row[f'{stage}_ms']) for stage in STAGES)),
         reason=row['reason'],
     )

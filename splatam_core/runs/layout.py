@@ -17,11 +17,12 @@
 
 from __future__ import annotations
 
-import shutil
+import contextlib
+import json
+import re
 from pathlib import Path
 
-from splatam_core.atomic_io import is_unfinished
-from splatam_core.errors import RunFolderError
+from splatam_core.errors import RunFolderError, one_line
 
 TRAJECTORY = 'trajectory.txt'
 FRAMES = 'frames.csv'
@@ -37,36 +38,118 @@ RESULTS = (MAP, METRICS, SCORES, REPORT, PAGE)
 """The files that depend on every frame of the run."""
 CHECKPOINTS = 'checkpoints'
 PREVIOUS = 'previous'
+KEYFRAMES = 'keyframes'
+
+
+PROGRAMS = ('splatam run', 'splatam refine', 'splatam_node')
+"""What writes run folders, as ``run.json`` names it."""
 
 
 def check_is_free(path: Path) -> None:
     """Checks that nothing is at a path, or only an empty folder.
 
     Raises:
-        RunFolderError: something is there.
+        RunFolderError: something is there, or nobody can tell.
     """
-    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
-        hint = ', or replace the run in it with --overwrite (the node: overwrite:=true)' if (path / RUN).is_file() else ''
+    try:
+        is_free = not _exists(path) or (path.is_dir() and not any(path.iterdir()))
+        holds_run = (path / RUN).is_file()
+    except (OSError, ValueError) as error:
+        raise RunFolderError(f'{path}: cannot be used: {why_not(error)}; choose another folder') from None
+    if not is_free:
+        hint = ', or replace the run in it with --overwrite (the node: overwrite:=true)' if holds_run else ''
         raise RunFolderError(f'{path} exists: choose another folder{hint}')
 
 
+def _exists(path: Path) -> bool:
+    """Returns True for a link to nowhere, too. Raises OSError or ValueError for what can be no path."""
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
+
+
 def remove_run(path: Path) -> None:
-    """Removes a run folder.
+    """Removes the run in a folder: file by file, only those that a run writes. The empty folder stays.
 
     Raises:
-        RunFolderError: the folder holds no run, or also files that no run writes; nothing is removed then.
+        RunFolderError: the folder holds no run of ours, or also files that no run writes; nothing is removed then.
         OSError: it cannot be removed.
     """
-    if not (path / RUN).is_file():
-        raise RunFolderError(f'{path} holds no run ({RUN} is missing), so it is not overwritten: choose another folder')
-    others = sorted(entry.name for entry in path.iterdir() if not _belongs_to_a_run(entry.name))
+    if reason := _why_no_run(path):
+        raise RunFolderError(f'{path} holds no run ({reason}), so it is not overwritten: choose another folder')
+    ours, others = _sorted_out(path)
     if others:
+        named = ', '.join(str(entry.relative_to(path)) for entry in sorted(others)[:5])
         raise RunFolderError(
-            f'{path} holds more than a run ({", ".join(others[:5])}), so it is not overwritten: '
-            'move these files away or choose another folder'
+            f'{path} holds more than a run ({named}), so it is not overwritten: move these files away or choose another folder'
         )
-    shutil.rmtree(path)
+    _remove(ours)
 
 
-def _belongs_to_a_run(name: str) -> bool:
-    return name in (*FILES, CHECKPOINTS, PREVIOUS) or is_unfinished(name, FILES)
+def remove_previous(path: Path) -> None:
+    """Removes the files of the run in a run folder's ``previous/``, and nothing else there.
+
+    Raises:
+        OSError: they cannot be removed.
+    """
+    previous = path / PREVIOUS
+    if previous.is_dir() and not previous.is_symlink():
+        _remove(_sorted_out(path, PREVIOUS)[0])
+
+
+def _why_no_run(path: Path) -> str:
+    """Returns why ``run.json`` in a folder is not one that this package wrote; empty if it is."""
+    file = path / RUN
+    if file.is_symlink() or not file.is_file():
+        return f'{RUN} is missing'
+    try:
+        information = json.loads(file.read_text(encoding='utf-8'))
+        if information['program'] in PROGRAMS and {'source', 'camera', 'versions'} <= information.keys():
+            return ''
+    except Exception:  # noqa: BLE001 - whatever it holds, it is not ours
+        pass
+    return f'{RUN} is of another program'
+
+
+def _sorted_out(path: Path, folder: str = '.') -> tuple[list[Path], list[Path]]:
+    """Returns what a run wrote in its folder, and what it did not, contents of folders first. Links are never followed."""
+    ours, others = [], []
+    for entry in sorted((path / folder).iterdir(), key=lambda entry: entry.name == RUN):  # run.json last: it marks what is left
+        inner = entry.relative_to(path).as_posix()
+        if inner in _NAMES and entry.is_dir() and not entry.is_symlink():
+            inner_ours, inner_others = _sorted_out(path, inner)
+            ours += [*inner_ours, entry]
+            others += inner_others
+        else:
+            is_ours = entry.is_file() and not entry.is_symlink() and _NAMES[folder].fullmatch(entry.name)
+            (ours if is_ours else others).append(entry)
+    return ours, others
+
+
+def _names(pattern: str) -> re.Pattern[str]:
+    """Returns a pattern of these file names, and of what a killed writer leaves behind (``atomic_io.replaced``)."""
+    return re.compile(rf'(?:{pattern})|\.(?:{pattern})\.\d+')
+
+
+_FILES = _names('|'.join(map(re.escape, FILES)))
+_NAMES = {
+    '.': _FILES, PREVIOUS: _FILES, CHECKPOINTS: _names(r'\d+\.checkpoint'),
+    f'{CHECKPOINTS}/{KEYFRAMES}': _names(r'[0-9a-f]{64}\.keyframe'),
+}  # fmt: skip
+"""The folders of a run, and the names of the files that a run writes there."""
+
+
+def _remove(entries: list[Path]) -> None:
+    for entry in entries:
+        if entry.is_dir():
+            with contextlib.suppress(OSError):  # not empty: it holds what is not ours
+                entry.rmdir()
+        else:
+            entry.unlink()
+
+
+def why_not(error: OSError | ValueError) -> str:
+    """Returns why a path cannot be used; some errors of the standard library have no text of the system."""
+    return (error.strerror if isinstance(error, OSError) else None) or one_line(error)

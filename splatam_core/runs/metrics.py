@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import math
+from array import array
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from splatam_core.errors import RunFolderError
+from splatam_core.errors import RunFolderError, one_line
 from splatam_core.runs.frame_records import STAGES, FrameRecord
-from splatam_core.types import StageTimings, Status
+from splatam_core.types import Status
+
+MAX_TIMINGS = 1 << 17
+"""Largest number of frames whose timings are kept, for their percentiles: 5 MiB. Longer runs keep every second, fourth, ..."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +165,7 @@ class Metrics:
 
     def to_json(self) -> str:
         """Returns the text of ``metrics.json``."""
-        values = self.values()
+        values = {name: None if _is_beyond_numbers(value) else value for name, value in self.values().items()}
         values['timings_ms'] = {name: asdict(stage) for name, stage in self.timings_ms.items()}
         values['notes'] = dict(self.notes)
         return json.dumps(values, indent=2, allow_nan=False) + '\n'
@@ -176,9 +182,30 @@ class Metrics:
             known = {entry.name: values[entry.name] for entry in fields(cls) if entry.name in values}
             known |= {name: _group(name, kind, values) for name, kind in GROUPS.items()}
             known['timings_ms'] = {name: StageStatistics(**stage) for name, stage in known['timings_ms'].items()}
-            return cls(**known)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise RunFolderError(f'metrics.json cannot be read: {error}; delete it and evaluate again') from None
+            metrics = cls(**known)
+            metrics._check()
+            return metrics
+        except Exception as error:  # noqa: BLE001 - whatever the file holds, it is refused in one line
+            raise RunFolderError(f'metrics.json cannot be read: {one_line(error)}; delete it and evaluate again') from None
+
+    def _check(self) -> None:
+        """Raises ValueError where a value is not of its kind."""
+        values = self.values() | {f'timings_ms.{name}': stage.median for name, stage in self.timings_ms.items()}
+        values |= {f'timings_ms.{name}.p95': stage.p95 for name, stage in self.timings_ms.items()}
+        counts, other = ('frames', 'tracked', 'lost'), ('timings_ms', 'notes', 'novel_alignment')
+        for name, value in values.items():
+            is_number = type(value) in (int, float) and math.isfinite(value)
+            is_right = type(value) is int if name in counts else value is None or is_number
+            if name not in other and not is_right:
+                raise ValueError(f'{name} = {value!r}')
+        if not isinstance(self.notes, dict) or not all(isinstance(note, str) for note in self.notes.values()):
+            raise ValueError(f'notes = {self.notes!r}')
+        if not isinstance(self.novel_alignment, str | None):
+            raise ValueError(f'novel_alignment = {self.novel_alignment!r}')
+
+
+def _is_beyond_numbers(value: object) -> bool:
+    return isinstance(value, float) and not math.isfinite(value)
 
 
 GROUPS: Mapping[str, type[ImageScores] | type[OriginalScores]] = {
@@ -192,8 +219,69 @@ def _group(name: str, kind: type[ImageScores] | type[OriginalScores], values: Ma
     return kind(**{entry.name: values.get(f'{name}_{entry.name}') for entry in fields(kind)})
 
 
+class FrameStatistics:
+    """What ``Metrics`` says of the frames of a run, gathered frame by frame in bounded memory.
+
+    Attributes:
+        frames: number of frames.
+        lost: number of frames without a pose.
+    """
+
+    def __init__(self, records: Iterable[FrameRecord] = ()) -> None:
+        self.frames = self.lost = 0
+        self._process_ms = self._decode_ms = 0.0
+        self._num_decoded = 0
+        self._every = 1  # of so many frames, the timings of one are kept
+        self._timings = array('d')
+        for record in records:
+            self.add(record)
+
+    def add(self, record: FrameRecord) -> None:
+        """Adds the next frame."""
+        if self.frames % self._every == 0:
+            self._timings.extend(getattr(record.timings, stage) for stage in STAGES)
+            if len(self._timings) >= MAX_TIMINGS * len(STAGES):
+                self._every *= 2
+                self._timings = array('d', self._table()[::2].tobytes())
+        self.frames += 1
+        self.lost += record.status is Status.LOST
+        self._process_ms += record.process_ms
+        if record.decode_ms is not None:
+            self._decode_ms += record.decode_ms
+            self._num_decoded += 1
+
+    def metrics(
+        self, num_gaussians: int | None = None, peak_rss_mb: float | None = None, *,
+        peak_gpu_mb: float | None = None, finish_s: float = 0.0,
+    ) -> Metrics:  # fmt: skip
+        """Returns the metrics that need no ground truth. Arguments: see ``run_metrics``."""
+        process_ms = self._process_ms + 1e3 * finish_s
+        return Metrics(
+            frames=self.frames,
+            tracked=self.frames - self.lost,
+            lost=self.lost,
+            fps=_rate(self.frames, process_ms),
+            fps_with_io=_rate(self.frames, process_ms + self._decode_ms if self._num_decoded == self.frames else 0.0),
+            num_gaussians=num_gaussians,
+            peak_rss_mb=peak_rss_mb,
+            timings_ms=self._stage_statistics(),
+            finish_s=round(finish_s, 3),
+            peak_gpu_mb=peak_gpu_mb,
+        )
+
+    def _table(self) -> NDArray[np.float64]:
+        return np.frombuffer(self._timings, np.float64).reshape(-1, len(STAGES))  # [frames, stages]
+
+    def _stage_statistics(self) -> dict[str, StageStatistics]:
+        """Returns median and 95th percentile of each stage over the frames; empty without frames."""
+        if not self._timings:
+            return {}
+        median, p95 = np.percentile(self._table(), [50, 95], axis=0)
+        return {stage: StageStatistics(round(float(m), 3), round(float(p), 3)) for stage, m, p in zip(STAGES, median, p95)}
+
+
 def run_metrics(
-    records: Sequence[FrameRecord], num_gaussians: int | None = None, peak_rss_mb: float | None = None, *,
+    records: Iterable[FrameRecord], num_gaussians: int | None = None, peak_rss_mb: float | None = None, *,
     peak_gpu_mb: float | None = None, finish_s: float = 0.0,
 ) -> Metrics:  # fmt: skip
     """Returns the metrics that need no ground truth.
@@ -205,32 +293,8 @@ def run_metrics(
         peak_gpu_mb: largest memory on a GPU, MiB; None where no GPU was used.
         finish_s: wall time in ``Slam.finish``.
     """
-    lost = sum(record.status is Status.LOST for record in records)
-    process_ms = sum(record.process_ms for record in records) + 1e3 * finish_s
-    decode_ms = [record.decode_ms for record in records if record.decode_ms is not None]
-    with_io_ms = process_ms + sum(decode_ms) if len(decode_ms) == len(records) else 0.0
-    return Metrics(
-        frames=len(records),
-        tracked=len(records) - lost,
-        lost=lost,
-        fps=_rate(len(records), process_ms),
-        fps_with_io=_rate(len(records), with_io_ms),
-        num_gaussians=num_gaussians,
-        peak_rss_mb=peak_rss_mb,
-        timings_ms=stage_statistics([record.timings for record in records]),
-        finish_s=round(finish_s, 3),
-        peak_gpu_mb=peak_gpu_mb,
-    )
+    return FrameStatistics(records).metrics(num_gaussians, peak_rss_mb, peak_gpu_mb=peak_gpu_mb, finish_s=finish_s)
 
 
 def _rate(frames: int, wall_ms: float) -> float | None:
     return round(frames / wall_ms * 1e3, 3) if wall_ms > 0 else None
-
-
-def stage_statistics(timings: Sequence[StageTimings]) -> dict[str, StageStatistics]:
-    """Returns median and 95th percentile of each stage over the frames; empty without frames."""
-    if not timings:
-        return {}
-    table = np.array([[getattr(frame, stage) for stage in STAGES] for frame in timings])  # [frames, stages]
-    median, p95 = np.percentile(table, [50, 95], axis=0)
-    return {stage: StageStatistics(round(float(m), 3), round(float(p), 3)) for stage, m, p in zip(STAGES, median, p95)}

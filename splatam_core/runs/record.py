@@ -7,21 +7,23 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core.config import SlamConfig, load_config
-from splatam_core.errors import RunFolderError, SplatamError
+from splatam_core.errors import RunFolderError, SplatamError, one_line
 from splatam_core.geometry.camera import PinholeCamera
-from splatam_core.geometry.trajectory import Trajectory, read_trajectory
+from splatam_core.geometry.trajectory import Trajectory
 from splatam_core.maps.ply import read_ply
 from splatam_core.rasterizer import Gaussians
-from splatam_core.runs.frame_records import FrameRecord, read_frame_records, read_lost
-from splatam_core.runs.layout import CONFIG, FRAMES, MAP, METRICS, RUN, TRAJECTORY
+from splatam_core.runs.frame_records import FrameRecord, complete_lines, read_frame_records, read_lost, read_poses
+from splatam_core.runs.layout import CONFIG, FRAMES, MAP, METRICS, RUN, TRAJECTORY, why_not
 from splatam_core.runs.metrics import Metrics, run_metrics
 
 KEEP_CHECKPOINTS = 2
+Made = TypeVar('Made')
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,9 +160,9 @@ class RunRecord(RunSettings):
         if not path.exists():
             return run_metrics(self.frames)
         try:
-            return Metrics.from_json(path.read_text())
-        except RunFolderError as error:
-            raise RunFolderError(f'{self.path}: {error}') from None
+            return Metrics.from_json(path.read_text(encoding='utf-8'))
+        except (RunFolderError, OSError, UnicodeDecodeError) as error:
+            raise RunFolderError(f'{self.path}: {one_line(error)}') from None
 
 
 def read_settings(path: Path) -> RunSettings:
@@ -170,23 +172,39 @@ def read_settings(path: Path) -> RunSettings:
         RunFolderError: the path is no run folder, or one of its files is damaged.
     """
     with read_errors(path):
-        information = json.loads((path / RUN).read_text())
+        information = json.loads((path / RUN).read_text(encoding='utf-8'))
         source, camera = information['source'], information['camera']
+        description = {name: information[name] for name in ('program', 'preset')}
+        description |= {name: information[name] for name in ('checkpoint_every', 'keep_checkpoints') if name in information}
         return RunSettings(
             path=path,
             config=load_config(str(path / CONFIG)),
-            description=RunDescription(
-                program=information['program'],
-                preset=information['preset'],
-                source=None if source is None else Source(**source),
-                checkpoint_every=information.get('checkpoint_every'),
-                keep_checkpoints=information.get('keep_checkpoints', KEEP_CHECKPOINTS),
-            ),
-            camera=None if camera is None else PinholeCamera(**camera),
+            description=_typed(RunDescription, description | {'source': None if source is None else _typed(Source, source)}),
+            camera=None if camera is None else _typed(PinholeCamera, camera),
             commit=information['commit'],
-            machine=information['machine'],
-            versions=information['versions'],
+            machine=_table(information, 'machine'),
+            versions=_table(information, 'versions'),
         )
+
+
+def _typed(kind: type[Made], values: dict[str, Any]) -> Made:
+    """Returns a dataclass made of values from a file.
+
+    Raises:
+        TypeError: a value is missing, unknown, or not of the type of its field.
+    """
+    hints = get_type_hints(kind)
+    for name, value in values.items():
+        allowed = hints.get(name, object)
+        if not isinstance(value, allowed | int if allowed is float else allowed):
+            raise TypeError(f'{name} = {value!r}')
+    return kind(**values)
+
+
+def _table(information: dict[str, Any], name: str) -> dict[str, Any]:
+    if not isinstance(information[name], dict):
+        raise TypeError(f'{name} = {information[name]!r}')
+    return information[name]
 
 
 def read_run(path: Path) -> RunRecord:
@@ -197,6 +215,7 @@ def read_run(path: Path) -> RunRecord:
     """
     settings = read_settings(path)
     with read_errors(path):
+        lines = complete_lines(path / TRAJECTORY)
         return RunRecord(
             path=path,
             config=settings.config,
@@ -205,8 +224,8 @@ def read_run(path: Path) -> RunRecord:
             commit=settings.commit,
             machine=settings.machine,
             versions=settings.versions,
-            trajectory=read_trajectory(path / TRAJECTORY),
-            lost_ns=read_lost(path / TRAJECTORY),
+            trajectory=read_poses(lines, TRAJECTORY),
+            lost_ns=read_lost(lines),
             frames=read_frame_records(path / FRAMES),
         )
 
@@ -218,11 +237,17 @@ def read_errors(path: Path) -> Iterator[None]:
     Raises:
         RunFolderError: the path is no run folder, or the block raised such an error.
     """
-    if missing := [name for name in (TRAJECTORY, CONFIG, RUN) if not (path / name).is_file()]:
+    try:
+        missing = [name for name in (TRAJECTORY, CONFIG, RUN) if not (path / name).is_file()]
+    except (OSError, ValueError) as error:
+        raise RunFolderError(f'{path} cannot be read: {why_not(error)}') from None
+    if missing:
         raise RunFolderError(f'{path} is no run folder: it has no {", ".join(missing)}')
     try:
         yield
     except SplatamError as error:
         raise RunFolderError(f'{path} cannot be read: {error}') from None
-    except (OSError, KeyError, TypeError, ValueError, IndexError) as error:
-        raise RunFolderError(f'{path} cannot be read: {error!r}; if another version wrote it, read it with that version') from None
+    except Exception as error:  # noqa: BLE001 - whatever a file of the folder holds, it is refused in one line
+        raise RunFolderError(
+            f'{path} cannot be read: {one_line(repr(error))}; if another version wrote it, read it with that version'
+        ) from None

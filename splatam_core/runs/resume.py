@@ -10,7 +10,7 @@ from pathlib import Path
 from splatam_core.config import WHERE, SlamConfig, computed_on, flat_values
 from splatam_core.datasets.base import Sequence as FrameSequence
 from splatam_core.datasets.known_poses import FramesWithGroundTruth
-from splatam_core.errors import CheckpointError
+from splatam_core.errors import CheckpointError, one_line
 from splatam_core.runs import provenance
 from splatam_core.runs.checkpoints import Checkpoint, Checkpoints, Progress, read_newest
 from splatam_core.runs.layout import CHECKPOINTS, CONFIG
@@ -173,7 +173,8 @@ def _check_frames(sequence: FrameSequence, checkpoint: Checkpoint) -> None:
 def _restore(slam: Slam, checkpoint: Checkpoint) -> None:
     try:
         slam.restore(checkpoint.state)
-    except (KeyError, TypeError, ValueError) as error:
+    except Exception as error:  # noqa: BLE001 - whatever a file holds, it is refused in one line
         raise CheckpointError(
-            f'{checkpoint.path}: does not fit its own settings: {error}; use the version that wrote it, or start a new run'
+            f'{checkpoint.path}: does not fit its own settings: {one_line(error)}; use the version that wrote it, or '
+            'start a new run'
         ) from None

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 import shutil
-from collections.abc import Sequence
-from dataclasses import asdict
+from contextlib import ExitStack
+from dataclasses import asdict, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, TextIO
+from typing import Any, Protocol
 
 from splatam_core.atomic_io import new_folder, replace_text
 from splatam_core.config import SlamConfig, to_yaml
 from splatam_core.device import choose_backend
-from splatam_core.errors import RunFolderError
+from splatam_core.errors import RunFolderError, one_line
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.trajectory import stamp_from_text
 from splatam_core.mapping.gaussian_map import GaussianMap
@@ -35,9 +36,12 @@ from splatam_core.runs.layout import (
     RUN,
     TRAJECTORY,
     check_is_free,
+    remove_previous,
     remove_run,
+    why_not,
 )
-from splatam_core.runs.metrics import Metrics, run_metrics
+from splatam_core.runs.line_file import LineFile
+from splatam_core.runs.metrics import FrameStatistics, Metrics
 from splatam_core.runs.record import RunDescription, RunRecord, read_errors, read_run
 from splatam_core.types import FrameResult, RgbdFrame
 
@@ -58,16 +62,19 @@ class RunFolder:
     Use it as a context manager, or call ``close``. It is not thread-safe.
     """
 
-    def __init__(self, path: Path, records: Sequence[FrameRecord] = ()) -> None:
+    def __init__(self, path: Path, statistics: FrameStatistics | None = None, *, has_camera: bool = False) -> None:
         """Opens the files of an existing folder to append to them.
 
         Args:
             path: the folder.
-            records: the frames that are in it already.
+            statistics: of the frames that are in it already; None = it has none.
+            has_camera: True if ``run.json`` names their camera.
         """
         self.path = path
-        self._records = list(records)
-        self._trajectory, self._frames = ((path / name).open('a', newline='\n') for name in (TRAJECTORY, FRAMES))
+        self._statistics = statistics or FrameStatistics()
+        self._has_camera = has_camera
+        self._camera: PinholeCamera | None = None
+        self._trajectory, self._frames = (LineFile(path / name) for name in (TRAJECTORY, FRAMES))
 
     @classmethod
     def create(cls, path: Path, config: SlamConfig, description: RunDescription, *, overwrite: bool = False) -> RunFolder:
@@ -85,13 +92,13 @@ class RunFolder:
         """
         backend = str(choose_backend(config))
         try:
-            if path.is_dir() and any(path.iterdir()) and overwrite:
+            if overwrite and path.is_dir() and any(path.iterdir()):
                 remove_run(path)
             check_is_free(path)
             path.mkdir(parents=True, exist_ok=True)
             return cls._begin(path, config, _run_information(description) | {'backend': backend})
-        except OSError as error:
-            raise RunFolderError(f'{path}: cannot be written: {error.strerror}; choose another folder') from None
+        except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+            raise RunFolderError(f'{path}: cannot be written: {why_not(error)}; choose another folder') from None
 
     @classmethod
     def reopen(cls, path: Path, num_frames: int, last_stamp_ns: int | None) -> RunFolder:
@@ -106,20 +113,21 @@ class RunFolder:
             RunFolderError: that frame is not in the folder; nothing is changed then.
         """
         _trim(path, num_frames, last_stamp_ns)
-        return cls(path, read_run(path).frames)
+        run = read_run(path)
+        return cls(path, FrameStatistics(run.frames), has_camera=run.camera is not None)
 
     @classmethod
     def _begin(cls, path: Path, config: SlamConfig, information: dict[str, Any]) -> RunFolder:
         replace_text(path / CONFIG, to_yaml(config))
         replace_text(path / RUN, _to_json(information))
         folder = cls(path)
-        _write_csv_row(folder._frames, CSV_HEADER)
+        folder._frames.write(_csv_row(CSV_HEADER))
         return folder
 
     @property
     def is_empty(self) -> bool:
         """True while the run has no frame."""
-        return not self._records
+        return self._statistics.frames == 0
 
     @property
     def has_previous(self) -> bool:
@@ -129,7 +137,7 @@ class RunFolder:
     @property
     def num_frames(self) -> int:
         """Number of frames in the folder."""
-        return len(self._records)
+        return self._statistics.frames
 
     def restarted(self, config: SlamConfig) -> RunFolder:
         """Begins a new run in the same folder, after a reset. Closes this object.
@@ -142,16 +150,16 @@ class RunFolder:
         previous = self.path / PREVIOUS
         try:
             self.close()
-            shutil.rmtree(previous, ignore_errors=True)
-            previous.mkdir()
+            remove_previous(self.path)
+            previous.mkdir(exist_ok=True)
             shutil.copy2(self.path / RUN, previous)  # a copy: RUN marks a run folder, so it must not be missing meanwhile
             for name in FILES:
                 if name != RUN and (self.path / name).exists():
                     (self.path / name).replace(previous / name)
-            information = json.loads((previous / RUN).read_text())
+            information = _information(previous)
             return self._begin(self.path, config, information | {'camera': None, 'started': _now()})
         except OSError as error:
-            raise RunFolderError(f'{self.path}: a new run cannot begin: {error.strerror}') from None
+            raise RunFolderError(f'{self.path}: a new run cannot begin: {why_not(error)}') from None
 
     def moved(self, path: Path) -> RunFolder:
         """Continues in another folder, with a copy of this one. Closes this object if that succeeds.
@@ -162,15 +170,17 @@ class RunFolder:
         check_is_free(path)
         temporary = path.with_name(f'.{path.name}.{os.getpid()}')
         try:
+            self.sync()
             shutil.copytree(self.path, temporary)
             temporary.replace(path)
-        except OSError as error:  # copytree's own error has no strerror
-            why = error.strerror or error
-            raise RunFolderError(f'{path}: cannot be written: {why}; choose another folder') from None
+        except (OSError, ValueError) as error:
+            raise RunFolderError(f'{path}: cannot be written: {why_not(error)}; choose another folder') from None
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
         self.close()
-        return RunFolder(path, self._records)
+        moved = RunFolder(path, self._statistics, has_camera=self._has_camera)
+        moved._camera = self._camera
+        return moved
 
     def append(self, frame: RgbdFrame, result: FrameResult, process_s: float, decode_s: float | None = None) -> None:
         """Appends one frame.
@@ -180,29 +190,36 @@ class RunFolder:
             result: output of ``Slam.process``.
             process_s: wall time in ``Slam.process``.
             decode_s: wall time to read and decode the frame; None where another thread did that during SLAM.
+
+        Raises:
+            OSError: the disk is full. What was not written is written with one of the next frames, as long as that is little;
+                the folder can be used further.
         """
         record = FrameRecord.of(result, process_s, decode_s)
-        self._records.append(record)
-        self._trajectory.write(trajectory_line(result) + '\n')
-        _write_csv_row(self._frames, record.csv_row())
-        self._trajectory.flush()
-        if len(self._records) == 1:
-            self._write_camera(frame.camera)
+        if self._trajectory.is_full or self._frames.is_full:
+            self._frames.flush()
+            self._trajectory.flush()
+        self._camera = self._camera or frame.camera
+        self._statistics.add(record)
+        with ExitStack() as each:  # all are tried, from the last to the first, whichever fails
+            each.callback(self._write_camera)
+            each.callback(self._frames.write, _csv_row(record.csv_row()))
+            each.callback(self._trajectory.write, trajectory_line(result))
 
     def sync(self) -> None:
         """Waits until the frames so far would survive a power cut."""
         for file in (self._trajectory, self._frames):
-            file.flush()
-            os.fsync(file.fileno())
+            file.sync()
 
     def note_resumption(self, config: SlamConfig) -> None:
         """Adds to ``run.json`` when, with which commit and on which backend the run is resumed."""
-        information = json.loads((self.path / RUN).read_text())
+        information = _information(self.path)
         resumption = {
             'after_frames': self.num_frames, 'started': _now(), 'commit': provenance.commit(),
             'backend': str(choose_backend(config)),
         }  # fmt: skip
-        information['resumed'] = [*information.get('resumed', []), resumption]
+        before = information.get('resumed')
+        information['resumed'] = [*(before if isinstance(before, list) else []), resumption]
         replace_text(self.path / RUN, _to_json(information))
 
     def save(self, slam: SavableSlam, finish_s: float = 0.0) -> Metrics:
@@ -215,10 +232,14 @@ class RunFolder:
         Raises:
             OSError: a file cannot be written; its previous version stays.
         """
+        self._write_camera()
         replace_text(self.path / CONFIG, to_yaml(slam.config))
         gaussians = slam.map.gaussians
         write_ply(self.path / MAP, gaussians)
-        metrics = _metrics_of_this_process(self._records, len(gaussians), finish_s)
+        metrics = _metrics_of_this_process(self._statistics, len(gaussians), finish_s)
+        if slam.map.num_refused:
+            refused = f'{slam.map.num_refused} Gaussians were not finite and were left out of the map'
+            metrics = replace(metrics, notes={**metrics.notes, 'num_gaussians': refused})
         replace_text(self.path / METRICS, metrics.to_json())
         return metrics
 
@@ -235,9 +256,14 @@ class RunFolder:
             (self.path / name).unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Closes the files; nothing can be appended after that."""
-        self._trajectory.close()
-        self._frames.close()
+        """Closes the files; nothing can be appended after that.
+
+        Raises:
+            OSError: the last lines do not fit on the disk; the files are closed nevertheless.
+        """
+        with ExitStack() as both:
+            both.callback(self._frames.close)
+            both.callback(self._trajectory.close)
 
     def __enter__(self) -> RunFolder:
         return self
@@ -245,9 +271,11 @@ class RunFolder:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
         self.close()
 
-    def _write_camera(self, camera: PinholeCamera) -> None:
-        information = json.loads((self.path / RUN).read_text())
-        replace_text(self.path / RUN, _to_json(information | {'camera': asdict(camera)}))
+    def _write_camera(self) -> None:
+        """Writes the camera of the first frame, once it fits on the disk."""
+        if self._camera is not None and not self._has_camera:
+            replace_text(self.path / RUN, _to_json(_information(self.path) | {'camera': asdict(self._camera)}))
+            self._has_camera = True
 
 
 def write_refined(run: RunRecord, path: Path, gaussians: Gaussians, iterations: int, densified: bool = False) -> None:
@@ -263,7 +291,7 @@ def write_refined(run: RunRecord, path: Path, gaussians: Gaussians, iterations: 
     Raises:
         RunFolderError: something is at the path, or it cannot be written.
     """
-    information = json.loads((run.path / RUN).read_text())
+    information = _information(run.path)
     information |= {
         'program': 'splatam refine', 'refined_from': str(run.path.resolve()), 'refined_iterations': iterations,
         'refined_densified': densified, 'started': _now(), 'commit': provenance.commit(), 'machine': provenance.machine(),
@@ -277,9 +305,25 @@ def write_refined(run: RunRecord, path: Path, gaussians: Gaussians, iterations: 
                     shutil.copy2(run.path / name, folder)
             replace_text(folder / RUN, _to_json(information))
             write_ply(folder / MAP, gaussians)
-            replace_text(folder / METRICS, _metrics_of_this_process(run.frames, len(gaussians)).to_json())
+            replace_text(folder / METRICS, _metrics_of_this_process(FrameStatistics(run.frames), len(gaussians)).to_json())
     except OSError as error:
-        raise RunFolderError(f'{path}: cannot be written: {error.strerror}; choose another folder') from None
+        raise RunFolderError(f'{path}: cannot be written: {why_not(error)}; choose another folder') from None
+
+
+def _information(path: Path) -> dict[str, Any]:
+    """Returns what ``run.json`` in a folder holds.
+
+    Raises:
+        RunFolderError: it is damaged.
+        OSError: it cannot be read.
+    """
+    try:
+        information = json.loads((path / RUN).read_text(encoding='utf-8'))
+    except (ValueError, RecursionError) as error:
+        raise RunFolderError(f'{path / RUN} cannot be read: {one_line(error)}') from None
+    if not isinstance(information, dict):
+        raise RunFolderError(f'{path / RUN} cannot be read: it holds no object')
+    return information
 
 
 def _trim(path: Path, num_frames: int, last_stamp_ns: int | None) -> None:
@@ -297,14 +341,9 @@ def _trim(path: Path, num_frames: int, last_stamp_ns: int | None) -> None:
         replace_text(path / FRAMES, ''.join(frames))
 
 
-def _metrics_of_this_process(records: Sequence[FrameRecord], num_gaussians: int, finish_s: float = 0.0) -> Metrics:
-    return run_metrics(
-        records,
-        num_gaussians=num_gaussians,
-        finish_s=finish_s,
-        peak_rss_mb=provenance.peak_rss_mb(),
-        peak_gpu_mb=provenance.peak_gpu_mb(),
-    )
+def _metrics_of_this_process(statistics: FrameStatistics, num_gaussians: int, finish_s: float = 0.0) -> Metrics:
+    peak_rss_mb, peak_gpu_mb = provenance.peak_rss_mb(), provenance.peak_gpu_mb()
+    return statistics.metrics(num_gaussians, peak_rss_mb, peak_gpu_mb=peak_gpu_mb, finish_s=finish_s)
 
 
 def _run_information(description: RunDescription) -> dict[str, Any]:
@@ -326,6 +365,7 @@ def _to_json(values: dict[str, Any]) -> str:
     return json.dumps(values, indent=2) + '\n'
 
 
-def _write_csv_row(file: TextIO, row: list[str]) -> None:
-    csv.writer(file, lineterminator='\n').writerow(row)
-    file.flush()
+def _csv_row(row: list[str]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator='').writerow([cell.replace('\0', '') for cell in row])
+    return ' '.join(text.getvalue().splitlines())  # a reason is one line, whatever it quotes

@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 import os
 import re
+import resource
 import signal
 import subprocess
 import sys
 import textwrap
+import tracemalloc
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +24,9 @@ from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.maps.ply import read_ply
 from splatam_core.runs import provenance
-from splatam_core.runs.metrics import Metrics, StageStatistics, run_metrics
+from splatam_core.runs.frame_records import FrameRecord
+from splatam_core.runs.layout import check_is_free
+from splatam_core.runs.metrics import MAX_TIMINGS, FrameStatistics, Metrics, StageStatistics, run_metrics
 from splatam_core.runs.record import RunDescription, Source, read_run
 from splatam_core.runs.writer import RunFolder
 from splatam_core.slam import Slam
@@ -168,8 +174,14 @@ def test_overwrite_removes_a_run_and_nothing_else(tmp_path: Path) -> None:
     run = tmp_path / 'run'
     with RunFolder.create(run, CONFIG, NODE) as folder:
         folder.append(frame(0), result(0), 0.1)
-    (run / 'checkpoints').mkdir()
-    (run / 'checkpoints' / '1').touch()
+    keyframes = run / 'checkpoints' / 'keyframes'
+    keyframes.mkdir(parents=True)
+    for path in (
+        run / 'checkpoints' / '000040.checkpoint',
+        keyframes / f'{"0" * 64}.keyframe',
+        keyframes / f'.{"a" * 64}.keyframe.77',
+    ):
+        path.touch()
     (run / '.map.ply.4242').touch()  # left by a writer that was killed
     RunFolder.create(run, CONFIG, OFFLINE, overwrite=True).close()
     assert read_run(run).description == OFFLINE and len(read_run(run).trajectory) == 0
@@ -180,6 +192,83 @@ def test_overwrite_removes_a_run_and_nothing_else(tmp_path: Path) -> None:
     with pytest.raises(RunFolderError, match=r'more than a run \(thesis\.tex\)'):
         RunFolder.create(run, CONFIG, NODE, overwrite=True)
     assert tree(run) == before
+
+
+@pytest.mark.parametrize(
+    'name',
+    [
+        'checkpoints/thesis.tex', 'checkpoints/1', 'checkpoints/keyframes/holiday.jpg', 'keyframes/000001.keyframe',
+        'previous/notes.txt', 'previous/checkpoints/000001.checkpoint', 'map.ply/inside', '.map.ply.old', 'config.yaml.bak',
+    ],
+)  # fmt: skip
+def test_overwrite_refuses_what_no_run_writes_wherever_it_is(tmp_path: Path, name: str) -> None:
+    RunFolder.create(tmp_path, CONFIG, NODE).close()
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).write_text('years of work')
+    before = tree(tmp_path)
+    with pytest.raises(RunFolderError, match='more than a run') as caught:
+        RunFolder.create(tmp_path, CONFIG, NODE, overwrite=True)
+    assert name.split('/')[0] in str(caught.value) and tree(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    'text', ['', '{', '[]', '{}', '{"program": "npm run"}', '{"program": "splatam run"}', 'null', '\0', '[' * 10000]
+)
+def test_overwrite_refuses_a_run_json_of_another_program(tmp_path: Path, text: str) -> None:
+    (tmp_path / 'run.json').write_text(text)
+    (tmp_path / 'checkpoints').mkdir()
+    (tmp_path / 'checkpoints' / '000001.checkpoint').write_text('weights of a month of training')
+    before = tree(tmp_path)
+    with pytest.raises(RunFolderError, match='holds no run'):
+        RunFolder.create(tmp_path, CONFIG, NODE, overwrite=True)
+    assert tree(tmp_path) == before
+
+
+def test_overwrite_follows_no_link_out_of_the_folder(tmp_path: Path) -> None:
+    elsewhere, run = tmp_path / 'elsewhere', tmp_path / 'run'
+    (elsewhere / 'checkpoints').mkdir(parents=True)
+    (elsewhere / 'checkpoints' / '000001.checkpoint').write_text('of another run')
+    (elsewhere / 'map.ply').write_text('of another run')
+    for name in ('checkpoints', 'map.ply'):
+        RunFolder.create(run, CONFIG, NODE, overwrite=run.exists()).close()
+        (run / name).symlink_to(elsewhere / name)
+        before = tree(elsewhere)
+        with pytest.raises(RunFolderError, match=f'more than a run \\({name}\\)'):
+            RunFolder.create(run, CONFIG, NODE, overwrite=True)
+        assert tree(elsewhere) == before
+        (run / name).unlink()
+
+
+def test_overwrite_replaces_a_run_behind_a_link(tmp_path: Path) -> None:
+    run, link = tmp_path / 'run', tmp_path / 'latest'
+    written(RunFolder.create(run, CONFIG, NODE), 0).close()
+    link.symlink_to(run)
+    RunFolder.create(link, CONFIG, OFFLINE, overwrite=True).close()
+    assert link.is_symlink() and read_run(run).description == OFFLINE and len(read_run(link).frames) == 0
+
+
+def test_a_link_to_nowhere_is_said_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / 'link').symlink_to(tmp_path / 'nowhere')
+    for overwrite in (False, True):
+        with pytest.raises(RunFolderError, match='exists: choose another folder'):
+            RunFolder.create(tmp_path / 'link', CONFIG, NODE, overwrite=overwrite)
+
+
+def test_a_reset_leaves_what_others_put_into_previous(tmp_path: Path) -> None:
+    folder = written(RunFolder.create(tmp_path, CONFIG, NODE), 0).restarted(CONFIG)
+    (tmp_path / 'previous' / 'notes.txt').write_text('mine')
+    written(written(folder, 1).restarted(CONFIG), 2).close()
+    assert (tmp_path / 'previous' / 'notes.txt').read_text() == 'mine'
+    assert len(read_run(tmp_path / 'previous').frames) == 1
+
+
+@pytest.mark.parametrize('path', ['x' * 300, 'a/' * 3000, 'a\0b'])
+def test_impossible_paths_are_one_line(tmp_path: Path, path: str) -> None:
+    for use in (lambda p: RunFolder.create(p, CONFIG, NODE), lambda p: RunFolder.create(p, CONFIG, NODE, overwrite=True),
+                read_run, check_is_free):  # fmt: skip
+        with pytest.raises(RunFolderError) as caught:
+            use(tmp_path / path)
+        assert '\n' not in str(caught.value) and 'None' not in str(caught.value)
 
 
 @pytest.mark.parametrize('overwrite', [False, True])
@@ -200,7 +289,7 @@ def test_no_run_folder_and_damaged_ones_are_one_line(tmp_path: Path) -> None:
     RunFolder.create(tmp_path, CONFIG, NODE).close()
     for name, text in (
         ('run.json', '{'), ('run.json', '{}'), ('config.yaml', 'tracking: {iteratons: 3}'),
-        ('trajectory.txt', '# lost soon'), ('trajectory.txt', '1 2 3'), ('frames.csv', 'stamp\n1\n'),
+        ('trajectory.txt', '# lost soon\n'), ('trajectory.txt', '1 2 3\n'), ('frames.csv', 'stamp\n1\n'),
     ):  # fmt: skip
         good = (tmp_path / name).read_bytes()
         (tmp_path / name).write_text(text)
@@ -229,6 +318,124 @@ def test_kill_loses_nothing_written(tmp_path: Path) -> None:
     run = read_run(tmp_path / 'run')
     assert len(run.trajectory) == len(run.frames) == run.metrics().frames == 7
     assert run.metrics().num_gaussians is None
+
+
+@pytest.mark.parametrize('torn', ['1000000000.1 0.5 0.', '1', '# lost 10000', '\0' * 40, '', '1000000001.0 0 0 0 0 0 0 1'])
+def test_a_torn_last_line_is_left_out_and_said(tmp_path: Path, torn: str, caplog: pytest.LogCaptureFixture) -> None:
+    written(RunFolder.create(tmp_path, CONFIG, NODE), 0, 1, 2).close()
+    whole = read_run(tmp_path)
+    for name in ('trajectory.txt', 'frames.csv'):
+        with (tmp_path / name).open('a') as file:
+            file.write(torn)
+    with caplog.at_level('WARNING'):
+        run = read_run(tmp_path)
+    assert run.stamps_ns() == whole.stamps_ns() and run.frames == whole.frames and run.metrics() == whole.metrics()
+    assert [record.message.partition(': ')[2] for record in caplog.records] == (
+        ['its last line is incomplete and left out: was the writer stopped by force?'] * (2 if torn else 0)
+    )
+
+
+def test_a_line_that_is_torn_in_the_middle_is_one_line(tmp_path: Path) -> None:
+    written(RunFolder.create(tmp_path, CONFIG, NODE), 0, 1).close()
+    with (tmp_path / 'trajectory.txt').open('a') as file:
+        file.write('1000000000.1 0.5\n')
+    with pytest.raises(RunFolderError, match=r'trajectory\.txt:3: expected'):
+        read_run(tmp_path)
+
+
+@contextmanager
+def full_disk() -> Iterator[None]:
+    """No file may grow beyond one byte."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_disk_that_is_full_at_the_first_frames_costs_no_frame_once_there_is_room(tmp_path: Path) -> None:
+    """The camera used to be lost for good: no command could use the run."""
+    folder = RunFolder.create(tmp_path, CONFIG, NODE)
+    with full_disk():
+        for index in range(3):
+            with pytest.raises(OSError, match='too large'):
+                folder.append(frame(index), result(index), 0.01)
+    written(folder, 3).close()
+    run = read_run(tmp_path)
+    assert run.camera == CAMERA and len(run.frames) == len(run.trajectory) == 4
+    assert run.stamps_ns() == [result(index).stamp_ns for index in range(4)]
+
+
+def test_a_disk_that_stays_full_loses_whole_frames_and_bounds_the_memory(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path, CONFIG, NODE)
+    with full_disk():
+        refused = 0
+        for index in range(20_000):
+            try:
+                folder.append(frame_of_a_pixel(index), result(index, Status.LOST), 0.01)
+            except OSError:
+                refused += 1
+        assert refused == 20_000 and folder.num_frames < 20_000
+        kept = folder.num_frames
+    folder.append(frame_of_a_pixel(20_000), result(20_000), 0.01)
+    folder.close()
+    run = read_run(tmp_path)
+    assert len(run.frames) == len(run.stamps_ns()) == kept + 1
+
+
+def test_a_disk_that_is_full_at_the_end_closes_the_files(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path, CONFIG, NODE)
+    with full_disk():
+        with pytest.raises(OSError, match='too large'):
+            folder.append(frame(0), result(0), 0.01)
+        with pytest.raises(OSError, match='too large'):
+            folder.close()
+    folder.close()
+    assert len(read_run(tmp_path).frames) == 0
+
+
+def frame_of_a_pixel(index: int) -> RgbdFrame:
+    return RgbdFrame(10**18 + index * STEP_NS, np.zeros((1, 1, 3), np.uint8), np.ones((1, 1), np.float32), CAMERA)
+
+
+@pytest.mark.slow
+def test_a_million_frames_take_no_more_memory_than_a_hundred_thousand(tmp_path: Path) -> None:
+    """Nine hours at 30 Hz; a list of records would take 500 MB."""
+    folder, some = RunFolder.create(tmp_path, CONFIG, NODE), frame_of_a_pixel(0)
+    pose = np.eye(4)
+    used = {}
+    tracemalloc.start()
+    for index in range(1_000_001):
+        status = Status.TRACKED if index % 100 == 0 else Status.LOST
+        timings = StageTimings(total=float(index % 1000))
+        frame_result = FrameResult(
+            index, 10**18 + index * STEP_NS, status, pose if status is Status.TRACKED else None, False, 100 + index, 0.9, 0.8,
+            '', timings,
+        )  # fmt: skip
+        folder.append(some, frame_result, 0.01)
+        if index in (300_000, 1_000_000):
+            used[index] = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    metrics = folder._statistics.metrics()
+    folder.close()
+    assert used[1_000_000] - used[300_000] < 3 << 20
+    assert (metrics.frames, metrics.lost, metrics.fps) == (1_000_001, 990_000, 100.0)
+    assert metrics.timings_ms['total'].median == pytest.approx(499.5, abs=1)
+    assert metrics.timings_ms['total'].p95 == pytest.approx(949, abs=2)
+
+
+@pytest.mark.parametrize('count', [1, MAX_TIMINGS - 1, MAX_TIMINGS, 3 * MAX_TIMINGS + 5])
+def test_percentiles_are_exact_up_to_a_number_of_frames_and_close_beyond(count: int) -> None:
+    rng, statistics = np.random.default_rng(0), FrameStatistics()
+    total = rng.exponential(10.0, count)
+    for value in total:
+        statistics.add(FrameRecord(0, Status.TRACKED, False, 0, 0.0, 0.0, 1.0, None, StageTimings(total=float(value)), ''))
+    stage = statistics.metrics().timings_ms['total']
+    exact = count < MAX_TIMINGS
+    assert stage.median == pytest.approx(np.percentile(total, 50), rel=1e-9 if exact else 0.02, abs=6e-4)
+    assert stage.p95 == pytest.approx(np.percentile(total, 95), rel=1e-9 if exact else 0.02, abs=6e-4)
+    assert statistics.metrics().frames == count
 
 
 def written(folder: RunFolder, *indices: int) -> RunFolder:

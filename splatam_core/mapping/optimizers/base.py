@@ -75,6 +75,24 @@ def rates(config: MappingConfig) -> Rates:
     )
 
 
+def prune(gaussian_map: GaussianMap, config: MappingConfig, scene_radius: float, min_fraction: float | None = None) -> None:
+    """Drops what ``prunable`` and ``unusable`` find.
+
+    Args:
+        gaussian_map: changed in place.
+        config: says what is too faint or too wide.
+        scene_radius: metres.
+        min_fraction: drop only if more than this fraction of the map would go, because dropping copies the map; what is not
+            finite always goes. None = always.
+    """
+    chosen = prunable(gaussian_map, config.prune_opacity, config.prune_scale * scene_radius)
+    if (broken := unusable(gaussian_map)) is not None:
+        chosen = chosen | broken
+        gaussian_map.refuse(int(broken.sum()))
+    if broken is not None or min_fraction is None or torch.count_nonzero(chosen) > min_fraction * len(gaussian_map):
+        gaussian_map.keep(~chosen)
+
+
 def prunable(gaussian_map: GaussianMap, min_opacity: float, max_scale_m: float) -> Tensor:
     """Returns [N] which Gaussians are too faint to matter or too wide to be surface."""
     logits, widest = gaussian_map.logit_opacities.detach(), _widest(gaussian_map.log_scales.detach())
@@ -82,6 +100,24 @@ def prunable(gaussian_map: GaussianMap, min_opacity: float, max_scale_m: float) 
     if is_on_host(logits):  # numpy takes a fifth of torch's time, and every frame looks at the whole map
         return torch.from_numpy((logits.numpy() < faintest) | (widest.numpy() > limit))
     return (logits < faintest) | (widest > limit)
+
+
+def drop_unusable(gaussian_map: GaussianMap) -> None:
+    """Drops the Gaussians that are not ``Gaussians.usable``, and counts them."""
+    if (broken := unusable(gaussian_map)) is not None:
+        gaussian_map.refuse(int(broken.sum()))
+        gaussian_map.keep(~broken)
+
+
+def unusable(gaussian_map: GaussianMap) -> Tensor | None:
+    """Returns [N] which Gaussians are not ``Gaussians.usable``; None if all are, as far as a quick look at the sums shows."""
+    gaussians = gaussian_map.gaussians.detached()
+    parts = [gaussians.means, gaussians.log_scales, gaussians.logit_opacities, gaussians.rgb]
+    parts += [] if gaussians.rotations is None else [gaussians.rotations]
+    if math.isfinite(float(torch.stack([values.sum() for values in parts]).sum())):
+        return None
+    broken = ~gaussians.usable()
+    return broken if broken.any() else None
 
 
 def _widest(log_scales: Tensor) -> Tensor:

@@ -6,11 +6,10 @@ import time
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-import torch
 
 from splatam_core.config import MappingConfig
 from splatam_core.mapping.gaussian_map import GaussianMap
-from splatam_core.mapping.optimizers.base import TimeLimit, prunable, rates
+from splatam_core.mapping.optimizers.base import TimeLimit, prune, rates
 from splatam_core.mapping.posed import PosedView
 from splatam_core.rasterizer import Rasterizer, Rates, Target
 
@@ -31,9 +30,7 @@ class FusedOptimizer:
         """See ``MapOptimizer.fit``."""
         for posed in views:
             self._step(gaussian_map, posed, rates(self._config))
-        chosen = prunable(gaussian_map, self._config.prune_opacity, self._config.prune_scale * scene_radius)
-        if torch.count_nonzero(chosen) > self._config.fused.prune_fraction * len(gaussian_map):
-            gaussian_map.keep(~chosen)
+        prune(gaussian_map, self._config, scene_radius, self._config.fused.prune_fraction)
 
     def finish(self, gaussian_map: GaussianMap, keyframes: Sequence[PosedView], rng: np.random.Generator, limit: TimeLimit) -> int:
         """See ``MapOptimizer.finish``. Decreasing step sizes bring back what few steps a frame had forgotten."""

@@ -9,7 +9,7 @@ import numpy as np
 from splatam_core.config import MappingConfig
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.loss import mapping_loss
-from splatam_core.mapping.optimizers.base import TimeLimit, prunable, rates
+from splatam_core.mapping.optimizers.base import TimeLimit, drop_unusable, prune, rates
 from splatam_core.mapping.posed import PosedView
 from splatam_core.rasterizer import Rasterizer
 
@@ -27,9 +27,10 @@ class PaperOptimizer:
             render = self._rasterizer.render(gaussian_map.gaussians, posed.view.camera, posed.T_cam_world)
             mapping_loss(render, posed.view, self._config).backward()
             if self._prunes(step):
-                self._prune(gaussian_map, scene_radius)
+                prune(gaussian_map, self._config, scene_radius)
             gaussian_map.step()
         gaussian_map.stop_optimization()
+        drop_unusable(gaussian_map)
 
     def finish(self, gaussian_map: GaussianMap, keyframes: Sequence[PosedView], rng: np.random.Generator, limit: TimeLimit) -> int:
         """Leaves the map as it is, as in the paper; ``splatam refine`` optimizes a finished map."""
@@ -38,7 +39,3 @@ class PaperOptimizer:
     def _prunes(self, step: int) -> bool:
         every, until = self._config.paper.prune_every, self._config.paper.prune_until
         return every > 0 and step <= until and step % every == 0
-
-    def _prune(self, gaussian_map: GaussianMap, scene_radius: float) -> None:
-        max_scale_m = self._config.prune_scale * scene_radius
-        gaussian_map.keep(~prunable(gaussian_map, self._config.prune_opacity, max_scale_m))

@@ -21,7 +21,8 @@ import triton.language as tl
 from splatam_core.rasterizer import base
 
 NEAR_M = tl.constexpr(base.NEAR_M)
-FAR_M = tl.constexpr(1e30)  # not drawn beyond, nor where not finite
+FAR_M = tl.constexpr(base.HUGE)  # not drawn beyond, nor where not finite
+MAX_GRADIENT = tl.constexpr(1e15)
 BLUR_PX2 = tl.constexpr(base.BLUR_PX2)
 MAX_ALPHA = tl.constexpr(base.MAX_ALPHA)
 MIN_ALPHA = tl.constexpr(base.MIN_ALPHA)
@@ -54,9 +55,12 @@ def project(
     log_scale = tl.load(log_scales + i, mask=near, other=0.0)
     sigma = 0.5 * (fx + fy) * tl.exp(tl.minimum(log_scale, 40.0)) / z
     variance = sigma * sigma + BLUR_PX2
-    opacity = 1.0 / (1.0 + tl.exp(tl.minimum(-tl.load(logit_opacities + i, mask=near, other=0.0), 80.0)))
+    logit = tl.load(logit_opacities + i, mask=near, other=0.0)
+    opacity = 1.0 / (1.0 + tl.exp(tl.minimum(-logit, 80.0)))
     extent = tl.sqrt(2.0 * variance * (tl.log(tl.maximum(opacity / MIN_ALPHA, 1.0)) + 1e-5))
-    drawn = near & (opacity >= MIN_ALPHA)
+    drawn = near & (opacity >= MIN_ALPHA) & _is_usable(log_scale) & _is_usable(logit)
+    for channel in tl.static_range(3):
+        drawn = drawn & _is_usable(tl.load(rgb + 3 * i + channel, mask=near, other=0.0))
     drawn = drawn & (u + extent >= 0.0) & (u - extent <= width - 1.0) & (v + extent >= 0.0) & (v - extent <= height - 1.0)
     first, shape, count = _touched_tiles(
         tl.where(drawn, u, 0.0), tl.where(drawn, v, 0.0), tl.where(drawn, extent, 0.0), width, height, TILE
@@ -66,6 +70,12 @@ def project(
     tl.store(counts + i, tl.where(drawn, count, 0), mask=real)
     tl.store(depths + i, tl.where(drawn, z, float('inf')), mask=real)
     _store_splat(splats + FIELDS * i, u, v, -0.5 / variance, opacity, z, rgb + 3 * i, real, drawn)
+
+
+@triton.jit
+def _is_usable(values):
+    """Returns False for what is not finite, too."""
+    return tl.abs(values) < FAR_M
 
 
 @triton.jit
@@ -553,6 +563,11 @@ def update(
     falloff, z = tl.load(splat + 2, mask=seen, other=-1.0), tl.load(splat + 7, mask=seen, other=1.0)
     dx, dy, dz, by_scale = _through_projection(u, v, falloff, z, sx, sy, s2, sz, fx, fy, cx, cy)
     world_x, world_y, world_z = _to_world(pose, dx, dy, dz)
+    by_logit = s0 * (1.0 - tl.load(splat + 3, mask=seen, other=0.0))
+    # A gradient whose square overflows would stay in the moments for ever.
+    seen = seen & (tl.abs(world_x) < MAX_GRADIENT) & (tl.abs(world_y) < MAX_GRADIENT) & (tl.abs(world_z) < MAX_GRADIENT)
+    seen = seen & (tl.abs(by_scale) < MAX_GRADIENT) & (tl.abs(by_logit) < MAX_GRADIENT) & (tl.abs(sr) < MAX_GRADIENT)
+    seen = seen & (tl.abs(sg) < MAX_GRADIENT) & (tl.abs(sb) < MAX_GRADIENT)
     step = tl.minimum(tl.load(steps + i, mask=seen, other=0).to(tl.int32) + 1, 255)
     tl.store(steps + i, step.to(tl.uint8), mask=seen)
     left_1 = tl.load(corrections + 2 * step, mask=seen, other=1.0)
@@ -562,7 +577,6 @@ def update(
     y = _adam(means + 3 * i + 1, moment + 1, world_y, means_rate, left_1, left_2, seen)
     z = _adam(means + 3 * i + 2, moment + 2, world_z, means_rate, left_1, left_2, seen)
     log_scale = _adam(log_scales + i, moment + 3, by_scale, log_scales_rate, left_1, left_2, seen)
-    by_logit = s0 * (1.0 - tl.load(splat + 3, mask=seen, other=0.0))
     _adam(logit_opacities + i, moment + 4, by_logit, logit_opacities_rate, left_1, left_2, seen)
     _adam(rgb + 3 * i, moment + 5, sr, rgb_rate, left_1, left_2, seen)
     _adam(rgb + 3 * i + 1, moment + 6, sg, rgb_rate, left_1, left_2, seen)
