@@ -121,6 +121,7 @@ setup(
         'Topic :: Scientific/Engineering :: Image Processing',
     ],
     install_requires=[
+        'backports.zstd>=1.0',
         'jinja2>=3.1',
         'matplotlib>=3.6',
         'numpy>=1.26',

@@ -15,10 +15,18 @@ import numpy as np
 from msg_adapters import stamps
 from msg_adapters.errors import MessageError
 from msg_adapters.factory import MessageFactory
+from msg_adapters.image_size import check_size
 
 # Number of coefficients of each model; missing ones are zero.
 COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
-_NO_DISTORTION = ('', 'none', 'pinhole')
+
+# Names that recorders use, in the form of ``_plain_name``. RealSense's ROS driver publishes its models under the same names.
+_SAME_MODELS = {
+    'plumb_bob': 'plumb_bob', 'brown_conrady': 'plumb_bob', 'modified_brown_conrady': 'plumb_bob',
+    'inverse_brown_conrady': 'plumb_bob',
+    'rational_polynomial': 'rational_polynomial', 'equidistant': 'equidistant', 'kannala_brandt4': 'equidistant',
+}  # fmt: skip
+_MAX_PIXELS = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +56,8 @@ class CameraParameters:
 def parameters(message: Any, *, is_rectified: bool = False) -> CameraParameters:
     """Read a ``sensor_msgs/CameraInfo``: K and D, after binning and cropping to the region of interest.
 
-    For images that are already rectified (``image_rect``), P is the camera; K and D describe the raw images.
+    For images that are already rectified (``image_rect``), P is the camera; K and D describe the raw images. P is also
+    used if K is all zero.
 
     A model whose coefficients are all zero is 'none'. This includes 'equidistant': exact zeros do not come from a
     calibration, but from a driver that publishes rectified images.
@@ -58,9 +67,10 @@ def parameters(message: Any, *, is_rectified: bool = False) -> CameraParameters:
         is_rectified: True if its images are rectified.
 
     Raises:
-        MessageError: K (or P, for rectified images) is not calibrated, the size is zero, the distortion model is
+        MessageError: K (or P, for rectified images) is not calibrated, the size is zero or too large, the distortion model is
             unknown or has too many coefficients, or the region of interest is not within the image.
     """
+    is_rectified = is_rectified or has_only_p(message)
     fx, cx, fy, cy = _intrinsics('P', message.p, 4) if is_rectified else _intrinsics('K', message.k, 3)
     model, coefficients = ('none', ()) if is_rectified else _distortion(message)
     full = CameraParameters(
@@ -69,36 +79,56 @@ def parameters(message: Any, *, is_rectified: bool = False) -> CameraParameters:
     )  # fmt: skip
     if full.width < 1 or full.height < 1:
         raise MessageError(f'CameraInfo states that the image is {full.width}x{full.height}; fill in width and height')
-    return _binned(_cropped(full, message.roi), int(message.binning_x), int(message.binning_y))
+    camera = _binned(_cropped(full, message.roi), int(message.binning_x), int(message.binning_y))
+    check_size('the image that CameraInfo states', (camera.width, camera.height))
+    return camera
+
+
+def has_only_p(message: Any) -> bool:
+    """Returns True if K is all zero and P is not, as with cameras that publish only rectified images."""
+    k, p = ([float(value) for value in matrix] for matrix in (message.k, message.p))
+    return not any(k) and any(p)
 
 
 def _intrinsics(name: str, matrix: Sequence[float], columns: int) -> list[float]:
     """Returns fx, cx, fy, cy of a matrix given row by row, checked."""
     values = [float(value) for value in matrix]
+    if len(values) != 3 * columns:
+        raise MessageError(f'CameraInfo {name} has {len(values)} values; it must have {3 * columns}')
     fx, cx, fy, cy = values[0], values[2], values[columns + 1], values[columns + 2]
     if not (np.isfinite(values).all() and fx > 0 and fy > 0):
         raise MessageError(
             f'CameraInfo {name} = {values}: focal lengths must be positive and all values finite; '
             'the camera is not calibrated, or its driver does not publish the calibration'
         )
+    if max(fx, fy, abs(cx), abs(cy)) > _MAX_PIXELS:
+        raise MessageError(
+            f'CameraInfo {name} = {values}: focal lengths and principal point are in pixels, at most {_MAX_PIXELS:g}; '
+            'calibrate the camera'
+        )
     return [fx, cx, fy, cy]
 
 
 def _distortion(message: Any) -> tuple[str, tuple[float, ...]]:
-    model, values = message.distortion_model, [float(value) for value in message.d]
-    if model not in COEFFICIENTS and (model not in _NO_DISTORTION or any(values)):
-        raise MessageError(
-            f"CameraInfo distortion model '{model}' with D = {values} is not supported; "
-            f'supported are {", ".join(COEFFICIENTS)}, or no distortion (D all zero); rectify the images first'
-        )
-    if not np.isfinite(values).all():
-        raise MessageError(f'CameraInfo D = {values}: coefficients must be finite; calibrate the camera')
+    values = [float(value) for value in message.d]
     if not any(values):
         return 'none', ()
+    if not np.isfinite(values).all():
+        raise MessageError(f'CameraInfo D = {values}: coefficients must be finite; calibrate the camera')
+    model = _SAME_MODELS.get(_plain_name(message.distortion_model))
+    if model is None:
+        raise MessageError(
+            f"CameraInfo distortion model '{message.distortion_model}' with D = {values} is not supported; "
+            f'supported are {", ".join(COEFFICIENTS)}, or any name with D all zero; rectify the images first'
+        )
     count = COEFFICIENTS[model]
     if any(values[count:]):
         raise MessageError(f'CameraInfo D = {values}: {model} has {count} coefficients, the others must be zero')
     return model, tuple((values + [0.0] * count)[:count])
+
+
+def _plain_name(model: str) -> str:
+    return '_'.join(model.lower().replace('_', ' ').replace('-', ' ').split())
 
 
 def _cropped(camera: CameraParameters, roi: Any) -> CameraParameters:

@@ -1,8 +1,8 @@
-"""Reads and makes ``sensor_msgs/CompressedImage`` as image_transport's plugins do: JPEG and PNG, and PNG depth.
+"""Reads and makes ``sensor_msgs/CompressedImage`` as image_transport's plugins do: JPEG and PNG, and PNG or RVL depth.
 
-The format field is ``rgb8; jpeg compressed bgr8``, ``16UC1; png compressed``, ``32FC1; compressedDepth png``
-or just ``jpeg``. The compressedDepth data start with 12 bytes: an int32 and the floats A and B. Stored
-counts are millimetres for 16UC1; for 32FC1 they are inverse depth, ``count = A / metres + B``, 0 = no reading.
+The format field is ``rgb8; jpeg compressed bgr8``, ``16UC1; png compressed``, ``32FC1; compressedDepth png``,
+``16UC1; compressedDepth rvl`` or just ``jpeg``. The compressedDepth data start with 12 bytes: an int32 and the floats
+A and B. Stored counts are millimetres for 16UC1; for 32FC1 they are inverse depth, ``count = A / metres + B``, 0 = no reading.
 """
 
 from __future__ import annotations
@@ -14,48 +14,53 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msg_adapters import stamps
+from msg_adapters import rvl, stamps
 from msg_adapters.encodings import Depth, DepthEncoding, Rgb, clean_metres, metres_from_counts
 from msg_adapters.errors import MessageError
 from msg_adapters.factory import MessageFactory
+from msg_adapters.image_size import JPEG, PNG, Size, check_color_size, check_depth_size, stated_size
 from msg_adapters.pixels import checked_depth, checked_rgb, millimetres
 
 _CONFIG = struct.Struct('<iff')
-_JPEG, _PNG = b'\xff\xd8', b'\x89PNG'
 _LARGEST_COUNT = 65535
 
 
-def decode_color(message: Any) -> Rgb:
-    """Decode a JPEG or PNG to [H, W, 3] RGB.
+def decode_color(message: Any, camera_size: Size | None = None) -> Rgb:
+    """Decode a JPEG or PNG to [H, W, 3] RGB, without turning it as its EXIF data say.
+
+    Args:
+        message: the image.
+        camera_size: width and height of the camera's images, if known.
 
     Raises:
-        MessageError: the message holds depth, another codec, or damaged data.
+        MessageError: the message holds depth, another codec, or damaged data, or states another size.
     """
     if 'compressedDepth' in message.format:
         raise MessageError(f"colour image has format '{message.format}', which is depth; check the topics' remapping")
-    bgr = _decoded(bytes(message.data), cv2.IMREAD_COLOR, message.format)
+    data = bytes(message.data)
+    check_color_size(_size(data, message.format), camera_size)
+    bgr = _decoded(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, message.format)
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def decode_depth(message: Any, metres_per_count: float) -> Depth:
-    """Decode a PNG to [H, W] metres, 0 = no reading.
+def decode_depth(message: Any, metres_per_count: float, camera_size: Size | None = None) -> Depth:
+    """Decode a PNG or RVL image to [H, W] metres, 0 = no reading.
 
     Args:
         message: the image.
         metres_per_count: length of one count of 16UC1 and mono16.
+        camera_size: width and height of the camera's images, if known.
 
     Raises:
-        MessageError: the message holds colour, another codec, or damaged data.
+        MessageError: the message holds colour, another codec, or damaged data, or states a much larger size.
     """
     data, depth_format = bytes(message.data), message.format
     if 'compressedDepth' not in depth_format:
-        return metres_from_counts(metres_per_count, _depth_counts(data, depth_format))
+        return metres_from_counts(metres_per_count, _depth_counts(data, depth_format, camera_size))
     if len(data) < _CONFIG.size:
         raise MessageError(f"depth image with format '{depth_format}' has {len(data)} bytes; it is truncated")
-    if 'rvl' in depth_format:
-        raise MessageError(f"depth image has format '{depth_format}'; only png is supported, set the publisher to it")
     _, a, b = _CONFIG.unpack_from(data)
-    counts = _depth_counts(data[_CONFIG.size :], depth_format)
+    counts = _depth_counts(data[_CONFIG.size :], depth_format, camera_size)
     encoding = depth_format.split(';')[0].strip()
     if encoding in ('16UC1', 'mono16'):
         return metres_from_counts(metres_per_count, counts)
@@ -65,12 +70,16 @@ def decode_depth(message: Any, metres_per_count: float) -> Depth:
 
 
 def _metres_from_inverse(counts: NDArray[np.uint16], a: float, b: float) -> Depth:
-    with np.errstate(divide='ignore'):
+    with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
         depth_m = np.float32(a) / (counts.astype(np.float32) - np.float32(b))
     return clean_metres(np.where(counts > 0, depth_m, np.float32(0)))
 
 
-def _depth_counts(data: bytes, depth_format: str) -> NDArray[np.uint16]:
+def _depth_counts(data: bytes, depth_format: str, camera_size: Size | None) -> NDArray[np.uint16]:
+    if 'rvl' in depth_format.lower():
+        check_depth_size(rvl.stated_size(data), camera_size)
+        return rvl.decode(data)
+    check_depth_size(_size(data, depth_format), camera_size)
     counts = _decoded(data, cv2.IMREAD_UNCHANGED, depth_format)
     if counts.ndim != 2 or counts.dtype != np.uint16:
         raise MessageError(
@@ -80,18 +89,35 @@ def _depth_counts(data: bytes, depth_format: str) -> NDArray[np.uint16]:
     return counts
 
 
-def _decoded(data: bytes, flags: int, image_format: str) -> NDArray[Any]:
-    if not data.startswith((_JPEG, _PNG)):
+def _size(data: bytes, image_format: str) -> Size:
+    """Returns the size that the image states in its header."""
+    if not data.startswith((JPEG, PNG)):
         raise MessageError(f"compressed image with format '{image_format}' holds neither JPEG nor PNG data")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if _is_complete(data) else None
-    if image is None:
-        raise MessageError(f"compressed image with format '{image_format}' ({len(data)} bytes) is truncated or damaged")
+    size = stated_size(data)
+    if size is None:
+        raise _damaged(data, image_format)
+    return size
+
+
+def _decoded(data: bytes, flags: int, image_format: str) -> NDArray[Any]:
+    if not _is_complete(data):
+        raise _damaged(data, image_format)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        image = None
+    if image is None or image.shape[1::-1] != stated_size(data):
+        raise _damaged(data, image_format)
     return image
+
+
+def _damaged(data: bytes, image_format: str) -> MessageError:
+    return MessageError(f"compressed image with format '{image_format}' ({len(data)} bytes) is truncated or damaged")
 
 
 def _is_complete(data: bytes) -> bool:
     """Returns True if an end marker follows the pixels; OpenCV before 4.12 fills missing pixels with grey."""
-    end, start = (b'\xff\xd9', b'\xff\xda') if data.startswith(_JPEG) else (b'IEND', b'IDAT')
+    end, start = (b'\xff\xd9', b'\xff\xda') if data.startswith(JPEG) else (b'IEND', b'IDAT')
     return data.rfind(end) > data.find(start) > 0 and data.rfind(end) > data.rfind(start)
 
 

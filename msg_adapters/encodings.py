@@ -79,6 +79,23 @@ COLOR: Mapping[str, Encoding] = {
 }
 
 
+ORDERED: Mapping[str, tuple[str, str]] = {'8UC3': ('bgr8', 'rgb8'), '8UC4': ('bgra8', 'rgba8')}
+"""OpenCV's names of colour images, which do not say the order of the channels: the encodings they can stand for."""
+
+RGB_ENCODINGS = ('bgr8', 'rgb8')
+"""What users can state about such images."""
+
+
+def color_encodings(stated: str | None) -> Mapping[str, Encoding]:
+    """Returns the encodings of colour images.
+
+    Args:
+        stated: how images are read whose encoding does not say the order of its channels: ``bgr8`` (also if None) or ``rgb8``.
+    """
+    position = 1 if stated == 'rgb8' else 0
+    return {**COLOR, '8UC1': COLOR['mono8'], **{name: COLOR[choice[position]] for name, choice in ORDERED.items()}}
+
+
 def depth_encodings(metres_per_count: float) -> Mapping[str, Encoding]:
     """Returns the encodings of depth images: 16-bit counts of some length, and floats in metres."""
     counts = Encoding('u2', 1, partial(metres_from_counts, metres_per_count))

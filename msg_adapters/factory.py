@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import array
 import importlib
+import re
 from collections.abc import Mapping
 from functools import cache
 from typing import Any, Protocol
@@ -14,6 +15,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from msg_adapters.errors import MessageError
+
+_NAME = re.compile(r'[A-Za-z]\w*', re.ASCII)
 
 
 class MessageFactory(Protocol):
@@ -73,8 +76,13 @@ def message_class(type_name: str) -> type:
         MessageError: the message's package is not installed, or has no such message.
     """
     package, _, name = type_name.partition('/msg/')
+    if not (_NAME.fullmatch(package) and _NAME.fullmatch(name)):
+        raise MessageError(f"message type '{type_name}' is no name of a type; expected package/msg/Name")
     try:
-        return getattr(importlib.import_module(f'{package}.msg'), name)
+        cls = getattr(importlib.import_module(f'{package}.msg'), name)
+        if not isinstance(cls, type):
+            raise AttributeError(f"'{package}.msg.{name}' is no class")
+        return cls
     except (ImportError, AttributeError) as error:
         raise MessageError(
             f'message type {type_name} is not installed ({error}); source a ROS 2 workspace that has it, '

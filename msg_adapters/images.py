@@ -16,6 +16,7 @@ from msg_adapters.compressed import compressed_color_message, compressed_depth_m
 from msg_adapters.encodings import MILLIMETRE, Depth, DepthEncoding, Rgb
 from msg_adapters.errors import MessageError
 from msg_adapters.factory import MessageFactory
+from msg_adapters.image_size import Size
 from msg_adapters.pixels import checked_depth, checked_mono, checked_rgb, millimetres
 
 __all__ = [
@@ -29,30 +30,38 @@ __all__ = [
 ]
 
 
-def decode_color(message: Any) -> Rgb:
+def decode_color(message: Any, *, camera_size: Size | None = None, rgb_encoding: str | None = None) -> Rgb:
     """Decode an Image or CompressedImage to [H, W, 3] uint8 RGB; a contiguous copy, not a view of the message.
+
+    Pixels stay as they are stored: an orientation in a JPEG is ignored, because CameraInfo describes the stored image.
+
+    Args:
+        message: the image.
+        camera_size: width and height of the camera's images, if known. Others are refused before they are decoded.
+        rgb_encoding: how to read 8UC3 and 8UC4: ``bgr8`` (also if None) or ``rgb8``.
 
     Raises:
         MessageError: the encoding or format is no supported colour one, or the data do not fit it.
     """
     if _is_raw(message):
-        return encodings.decode(message, encodings.COLOR, 'colour')
-    return compressed.decode_color(message)
+        return encodings.decode(message, encodings.color_encodings(rgb_encoding), 'colour')
+    return compressed.decode_color(message, camera_size)
 
 
-def decode_depth(message: Any, metres_per_count: float = MILLIMETRE) -> Depth:
+def decode_depth(message: Any, metres_per_count: float = MILLIMETRE, *, camera_size: Size | None = None) -> Depth:
     """Decode an Image or CompressedImage to [H, W] float32 metres, 0 = no reading; a copy, not a view of the message.
 
     Args:
         message: the image.
         metres_per_count: length of one count of 16UC1 and mono16; a millimetre by REP 118. 32FC1 is always in metres.
+        camera_size: width and height of the camera's images, if known. Much larger ones are refused before they are decoded.
 
     Raises:
         MessageError: the encoding or format is no supported depth one, or the data do not fit it.
     """
     if _is_raw(message):
         return encodings.decode(message, encodings.depth_encodings(metres_per_count), 'depth')
-    return compressed.decode_depth(message, metres_per_count)
+    return compressed.decode_depth(message, metres_per_count, camera_size)
 
 
 def _is_raw(message: Any) -> bool:

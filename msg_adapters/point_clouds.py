@@ -80,15 +80,19 @@ def read_cloud(message: Any) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     Raises:
         MessageError: a field is missing or has another type, or the data are truncated.
     """
-    dtype = _point_type(message)
+    offsets = _checked_fields(message)
     height, width, row_step = int(message.height), int(message.width), int(message.row_step)
-    row_bytes = width * dtype.itemsize
+    point_step = int(message.point_step)
+    row_bytes = width * point_step
     data = np.frombuffer(message.data, np.uint8)
     if row_step < row_bytes or data.size != height * row_step:
         raise MessageError(
-            f'point cloud of {height} rows of {width} points, {dtype.itemsize} bytes each, has row_step {row_step} '
+            f'point cloud of {height} rows of {width} points, {point_step} bytes each, has row_step {row_step} '
             f'and {data.size} bytes; it is truncated or states a wrong size'
         )
+    if not width * height:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    dtype = _point_type(message, offsets)
     rows = np.ascontiguousarray(data.reshape(height, row_step)[:, :row_bytes])
     records = rows.reshape(-1).view(dtype)
     points = np.stack([records[axis] for axis in 'xyz'], axis=-1).astype(np.float32)
@@ -96,8 +100,8 @@ def read_cloud(message: Any) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     return points, np.stack([bits >> 16 & 255, bits >> 8 & 255, bits & 255], axis=-1).astype(np.uint8)
 
 
-def _point_type(message: Any) -> np.dtype[Any]:
-    """Returns the structured dtype of a point, with rgb as an integer of the same bits."""
+def _checked_fields(message: Any) -> list[int]:
+    """Returns the offsets of x, y, z and rgb within a point."""
     fields = {field.name: field for field in message.fields}
     offsets = []
     for name in _FIELDS:
@@ -108,7 +112,12 @@ def _point_type(message: Any) -> np.dtype[Any]:
                 f'point cloud has fields {list(fields)}; expected {", ".join(_FIELDS)} as FLOAT32 '
                 f'(rgb also as UINT32) within the {message.point_step} bytes of a point'
             )
-        offsets.append(field.offset)
+        offsets.append(int(field.offset))
+    return offsets
+
+
+def _point_type(message: Any, offsets: list[int]) -> np.dtype[Any]:
+    """Returns the structured dtype of a point, with rgb as an integer of the same bits."""
     order = '>' if message.is_bigendian else '<'
     formats = [f'{order}f4'] * 3 + [f'{order}u4']
     return np.dtype({'names': _FIELDS, 'formats': formats, 'offsets': offsets, 'itemsize': message.point_step})

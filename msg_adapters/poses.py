@@ -13,13 +13,15 @@ from msg_adapters.errors import MessageError
 from msg_adapters.factory import MessageFactory
 
 Matrix = NDArray[np.float64]
+MAX_METRES = 1e9
+SHORTEST, LONGEST = 1e-6, 1e6  # lengths of quaternions; squares of far shorter ones lose their digits
 
 
 def pose_matrix(pose: Any) -> Matrix:
     """Convert a ``geometry_msgs/Pose`` to [4, 4]; the quaternion is normalised.
 
     Raises:
-        MessageError: a number is not finite, or the quaternion is zero.
+        MessageError: a number is not finite or far too large, or the quaternion is zero.
     """
     return _matrix('pose', pose.position, pose.orientation)
 
@@ -28,7 +30,7 @@ def transform_matrix(transform: Any) -> Matrix:
     """Convert a ``geometry_msgs/Transform`` to [4, 4]; the quaternion is normalised.
 
     Raises:
-        MessageError: a number is not finite, or the quaternion is zero.
+        MessageError: a number is not finite or far too large, or the quaternion is zero.
     """
     return _matrix('transform', transform.translation, transform.rotation)
 
@@ -37,8 +39,9 @@ def _matrix(what: str, p: Any, q: Any) -> Matrix:
     xyzw = np.array([q.x, q.y, q.z, q.w], dtype=np.float64)
     T = np.eye(4)
     T[:3, 3] = p.x, p.y, p.z
-    length = np.linalg.norm(xyzw)
-    if not (np.isfinite(T).all() and np.isfinite(length) and length > 0):
+    with np.errstate(over='ignore'):
+        length = np.linalg.norm(xyzw)
+    if not (np.abs(T[:3, 3]).max() <= MAX_METRES and SHORTEST <= length <= LONGEST):  # False for NaN
         raise MessageError(
             f'{what} with position {T[:3, 3].tolist()} and quaternion xyzw {xyzw.tolist()}: '
             'all must be finite, and the quaternion not zero'

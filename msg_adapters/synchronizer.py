@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from msg_adapters.epochs import EpochClock
+from msg_adapters.interval import PairInterval
 from msg_adapters.pairing import Key, first_pair
 
 Mode = Literal['exact', 'approximate']
@@ -52,6 +53,7 @@ class SyncStatistics:
         waiting_pairs: pairs waiting for the first CameraInfo.
         gap_ns: depth's stamp minus colour's in the newest pair; None before the first.
         newest_gap_ns: depth's stamp minus colour's of the last received, paired or not; None without both.
+        max_interval_ns: largest distance of partners now.
     """
 
     received_color: int
@@ -69,6 +71,7 @@ class SyncStatistics:
     waiting_pairs: int
     gap_ns: int | None
     newest_gap_ns: int | None
+    max_interval_ns: int
 
 
 class RgbdSynchronizer:
@@ -88,7 +91,7 @@ class RgbdSynchronizer:
     def __init__(
         self,
         mode: Mode = 'exact',
-        max_interval_ns: int = 20_000_000,
+        max_interval_ns: int | None = 20_000_000,
         queue_size: int = 30,
         jump_ns: int = 1_000_000_000,
     ) -> None:
@@ -96,7 +99,7 @@ class RgbdSynchronizer:
 
         Args:
             mode: 'exact' or 'approximate'.
-            max_interval_ns: largest distance of partners in approximate mode.
+            max_interval_ns: largest distance of partners in approximate mode; None adapts it to the rate, see ``PairInterval``.
             queue_size: number of messages of a stream that may wait.
             jump_ns: a stream whose stamps jump back by more than this has restarted.
 
@@ -105,12 +108,12 @@ class RgbdSynchronizer:
         """
         if mode not in ('exact', 'approximate'):
             raise ValueError(f"synchronizer mode '{mode}' must be 'exact' or 'approximate'")
-        if max_interval_ns < 0 or queue_size < 1 or jump_ns < 0:
+        if (max_interval_ns is not None and max_interval_ns < 0) or queue_size < 1 or jump_ns < 0:
             raise ValueError(
                 f'synchronizer max_interval_ns={max_interval_ns} queue_size={queue_size} jump_ns={jump_ns}: '
                 'the queue must hold at least 1 message, the times must not be negative'
             )
-        self._max_interval_ns = max_interval_ns if mode == 'approximate' else 0
+        self._interval = PairInterval(max_interval_ns if mode == 'approximate' else 0)
         self._clock = EpochClock(jump_ns)
         self._color = _Stream('color', queue_size)
         self._depth = _Stream('depth', queue_size)
@@ -123,6 +126,7 @@ class RgbdSynchronizer:
 
     def add_color(self, stamp_ns: int, message: Any) -> list[RgbdSet]:
         """Add a colour image. Returns the sets that it completes."""
+        self._interval.add_color(stamp_ns)
         return self._add(self._color, stamp_ns, message)
 
     def add_depth(self, stamp_ns: int, message: Any) -> list[RgbdSet]:
@@ -143,6 +147,11 @@ class RgbdSynchronizer:
         self._without_info += len(self._pairs)
         self._pairs.clear()
         return sets
+
+    @property
+    def max_interval_ns(self) -> int:
+        """Largest distance of partners now."""
+        return self._interval.ns
 
     @property
     def statistics(self) -> SyncStatistics:
@@ -167,6 +176,7 @@ class RgbdSynchronizer:
             waiting_pairs=len(self._pairs),
             gap_ns=self._gap_ns,
             newest_gap_ns=newest_gap_ns,
+            max_interval_ns=self._interval.ns,
         )
 
     def _add(self, stream: _Stream, stamp_ns: int, message: Any) -> list[RgbdSet]:
@@ -176,7 +186,7 @@ class RgbdSynchronizer:
         return self._release()
 
     def _form_pairs(self, is_final: bool = False) -> None:
-        while pair := first_pair(self._color.keys, self._depth.keys, self._max_interval_ns, is_final):
+        while pair := first_pair(self._color.keys, self._depth.keys, self._interval.ns, is_final):
             self._form_pair(*pair)
         while len(self._pairs) > self._queue_size and not self._infos.is_known:
             self._pairs.popleft()

@@ -134,7 +134,7 @@ def breach(module: str, imported: Import) -> str | None:
         return None
     if package == 'msg_adapters' and imported.top in MESSAGES | {'rosbags'}:
         return None if imported.deferred else 'message classes are imported only where one is built'
-    if imported.top in ('msg_adapters', 'rosbags') and is_inside(module, BAG_READER):
+    if imported.top in ('backports', 'msg_adapters', 'rosbags') and is_inside(module, BAG_READER):
         return None
     if imported.top == 'OpenEXR' and module == EXR_READER:
         return None if imported.deferred else 'OpenEXR is optional: import it where it is needed'

@@ -61,6 +61,11 @@ def add_source_arguments(parser: argparse.ArgumentParser, *, optional: bool = Fa
     parser.add_argument('--crop', type=int, default=0, metavar='P', help='cut P pixels off each edge after resizing')
     parser.add_argument('--split', choices=('train', 'test'), help='split of Replica-V2 and ScanNet++ to read (default: train)')
     parser.add_argument('--skip-bad', action='store_true', help='skip the frames that ScanNet++ flags as bad')
+    parser.add_argument(
+        '--max-interval', type=seconds, metavar='S', help='pair colour and depth at most S seconds apart (default: by their rate)'
+    )
+    parser.add_argument('--use-receive-time', action='store_true', help='take the times of recording of a bag for stamps')
+    parser.add_argument('--rgb-encoding', choices=('bgr8', 'rgb8'), help='how to read images of encoding 8UC3 (default: bgr8)')
     for topic, what in (('rgb', 'colour'), ('depth', 'depth'), ('info', 'camera info')):
         parser.add_argument(f'--{topic}', metavar='TOPIC', help=f'{what} topic of a bag (default: found by type)')
 
@@ -105,6 +110,9 @@ def source_of(args: argparse.Namespace) -> Source:
         crop=args.crop,
         split=args.split,
         skip_bad=args.skip_bad,
+        max_interval_s=args.max_interval,
+        use_receive_time=args.use_receive_time,
+        rgb_encoding=args.rgb_encoding,
     )
 
 
@@ -129,10 +137,12 @@ def source_words(source: Source) -> list[str]:
     given = {
         '--format': source.format, '--start': source.start, '--max-frames': source.max_frames, '--stride': source.stride,
         '--width': source.width, '--crop': source.crop, '--split': source.split, '--rgb': source.rgb,
-        '--depth': source.depth, '--info': source.info,
+        '--depth': source.depth, '--info': source.info, '--max-interval': source.max_interval_s,
+        '--rgb-encoding': source.rgb_encoding,
     }  # fmt: skip
     words = [str(word) for name, value in given.items() if value is not None for word in (name, value)]
-    return [source.path, *words, *(['--skip-bad'] if source.skip_bad else [])]
+    switches = {'--skip-bad': source.skip_bad, '--use-receive-time': source.use_receive_time}
+    return [source.path, *words, *(name for name, is_given in switches.items() if is_given)]
 
 
 def open_source(source: Source) -> Sequence:
@@ -155,6 +165,9 @@ def open_source(source: Source) -> Sequence:
         crop=source.crop,
         split=source.split,
         skip_bad=source.skip_bad,
+        max_interval_s=source.max_interval_s,
+        use_receive_time=source.use_receive_time,
+        rgb_encoding=source.rgb_encoding,
     )
 
 
@@ -210,6 +223,14 @@ def positive(text: str) -> int:
         raise argparse.ArgumentTypeError(f'{value} is not at least 1')
     if value > MAX_NUMBER:
         raise argparse.ArgumentTypeError(f'{value} is more than {MAX_NUMBER}')
+    return value
+
+
+def seconds(text: str) -> float:
+    """Returns a time of 0 to 10 s, for argparse."""
+    value = float(text)
+    if not 0 <= value <= 10:
+        raise argparse.ArgumentTypeError(f'{text} is not from 0 to 10')
     return value
 
 

@@ -18,6 +18,8 @@ FIRST_STAMP_NS = 1_000_000_000
 NOMINAL_RATE_HZ = 30
 MIN_SIZE = 16
 SPLITS = ('train', 'test')
+MAX_INTERVAL_S = 10.0
+RGB_ENCODINGS = ('bgr8', 'rgb8')
 
 
 class Sequence(Protocol):
@@ -74,6 +76,10 @@ class ReadOptions:
         crop: number of pixels to cut off each edge, after resizing.
         split: ``train`` or ``test`` part of a dataset that has such parts; None reads ``train``.
         skip_bad: True to skip frames that the dataset marks as bad.
+        max_interval_s: largest difference between the stamps of a colour and a depth image; None leaves it to the reader.
+        use_receive_time: True to take the times of recording of a bag's messages for their stamps.
+        rgb_encoding: how to read images of a bag whose encoding does not say the order of channels (8UC3): ``bgr8``, also if
+            None, or ``rgb8``.
     """
 
     width: int | None = None
@@ -84,6 +90,9 @@ class ReadOptions:
     crop: int = 0
     split: str | None = None
     skip_bad: bool = False
+    max_interval_s: float | None = None
+    use_receive_time: bool = False
+    rgb_encoding: str | None = None
 
     def __post_init__(self) -> None:
         if self.start < 0:
@@ -96,6 +105,10 @@ class ReadOptions:
             raise DatasetError(f'crop {self.crop}: must be at least 0 pixels')
         if self.split not in (None, *SPLITS):
             raise DatasetError(f"split '{self.split}' is not one of {', '.join(SPLITS)}")
+        if self.max_interval_s is not None and not 0 <= self.max_interval_s <= MAX_INTERVAL_S:
+            raise DatasetError(f'max_interval {self.max_interval_s}: must be from 0 to {MAX_INTERVAL_S:g} s')
+        if self.rgb_encoding not in (None, *RGB_ENCODINGS):
+            raise DatasetError(f"rgb_encoding '{self.rgb_encoding}' is not one of {', '.join(RGB_ENCODINGS)}")
 
     @property
     def last_asked(self) -> int | None:
@@ -114,7 +127,8 @@ class Format:
         accepts: returns True if a SOURCE can be read as this format when the user names it; None = as ``recognises``.
         open: opens the whole recording; the caller cuts out the window of ``ReadOptions``.
         is_path: True if a source is a file or folder.
-        has_topics: True if topics can be chosen.
+        has_topics: True if topics can be chosen, and messages have times of recording and encodings.
+        pairs_by_stamp: True if colour and depth are paired by their stamps.
         has_splits: True if the dataset has ``train`` and ``test`` parts.
         flags_bad: True if the dataset marks bad frames.
         is_last_resort: True to use this format only if no other one fits.
@@ -126,6 +140,7 @@ class Format:
     open: Callable[[str, ReadOptions], Sequence]
     is_path: bool = True
     has_topics: bool = False
+    pairs_by_stamp: bool = False
     has_splits: bool = False
     flags_bad: bool = False
     is_last_resort: bool = False

@@ -39,6 +39,9 @@ def open_sequence(
     crop: int = 0,
     split: str | None = None,
     skip_bad: bool = False,
+    max_interval_s: float | None = None,
+    use_receive_time: bool = False,
+    rgb_encoding: str | None = None,
 ) -> Sequence:
     """Open a recording.
 
@@ -54,6 +57,9 @@ def open_sequence(
         crop: number of pixels to cut off each edge, after resizing.
         split: ``train`` or ``test`` part of a dataset that has such parts; None reads ``train``.
         skip_bad: True to skip frames that the dataset marks as bad.
+        max_interval_s: largest difference between the stamps of a colour and a depth image; None leaves it to the reader.
+        use_receive_time: True to take the times of recording of a bag's messages for their stamps.
+        rgb_encoding: ``bgr8`` or ``rgb8``: how to read images of a bag whose encoding is 8UC3; None = bgr8, with a warning.
 
     Raises:
         DatasetError: the source has no known format, is damaged, or has no such frames.
@@ -62,6 +68,7 @@ def open_sequence(
     options = ReadOptions(
         width=width, start=start, max_frames=max_frames, topics=topics or BagTopics(),
         stride=stride, crop=crop, split=split, skip_bad=skip_bad,
+        max_interval_s=max_interval_s, use_receive_time=use_receive_time, rgb_encoding=rgb_encoding,
     )  # fmt: skip
     try:
         return _open(source, format, options)
@@ -86,6 +93,9 @@ def _check_options(source: str, reader: Format, options: ReadOptions) -> None:
         ('there are no topics to choose', options.topics != BagTopics() and not reader.has_topics),
         ('there is no train or test split', options.split is not None and not reader.has_splits),
         ('no frames are flagged as bad', options.skip_bad and not reader.flags_bad),
+        ('colour and depth are not paired by stamps', options.max_interval_s is not None and not reader.pairs_by_stamp),
+        ('there are no times of recording', options.use_receive_time and not reader.has_topics),
+        ('there are no encodings', options.rgb_encoding is not None and not reader.has_topics),
     ]
     for reason, is_given in unsuitable:
         if is_given:

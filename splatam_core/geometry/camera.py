@@ -29,6 +29,10 @@ LARGEST_PRINCIPAL_POINT = 1e6
 LARGEST_COEFFICIENT = 1e6
 
 
+SMALL_CHANGE = 0.05
+"""Largest change of focal length, or of principal point as a part of the image, that the focus of one camera explains."""
+
+
 @dataclass(frozen=True, slots=True)
 class PinholeCamera:
     """An ideal camera: size and focal lengths in pixels, principal point in pixel indices."""
@@ -132,6 +136,16 @@ class CameraCalibration:
     def is_distorted(self) -> bool:
         """Whether any distortion coefficient is not zero."""
         return any(self.distortion)
+
+    def is_close_to(self, other: CameraCalibration) -> bool:
+        """Returns True if images of both have one size and nearly one field of view, as those of a camera with autofocus."""
+        a, b = self.pinhole, other.pinhole
+        return (a.width, a.height) == (b.width, b.height) and all(
+            abs(this - that) <= SMALL_CHANGE * scale
+            for this, that, scale in (
+                (a.fx, b.fx, a.fx), (a.fy, b.fy, a.fy), (a.cx, b.cx, a.width), (a.cy, b.cy, a.height),
+            )
+        )  # fmt: skip
 
     @classmethod
     def from_intrinsics(cls, intrinsics: Intrinsics) -> CameraCalibration:

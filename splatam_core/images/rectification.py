@@ -134,6 +134,39 @@ class FrameFactory:
         return _resized(depth_m, (width, height), cv2.INTER_NEAREST_EXACT)
 
 
+class FrameFactories:
+    """Gives frames of one ideal camera while the calibration of the real one changes slightly, as with autofocus.
+
+    The first calibration states the ideal camera. One that differs more is another camera, with frames of its own.
+    """
+
+    NUM_CAMERAS = 8
+
+    def __init__(self, width: int | None = None) -> None:
+        """Start without cameras.
+
+        Args:
+            width: width of the frames in pixels; None keeps the recorded size.
+        """
+        self._width = width
+        self._cameras: list[CameraCalibration] = []
+        self._newest: FrameFactory | None = None
+
+    def of(self, calibration: CameraCalibration) -> FrameFactory:
+        """Returns the factory for images of a calibration.
+
+        Raises:
+            CameraError: the width cannot be used.
+        """
+        if self._newest is None or self._newest.calibration != calibration:
+            first = next((camera for camera in self._cameras if camera.is_close_to(calibration)), None)
+            if first is None:
+                first = calibration
+                self._cameras = [*self._cameras, calibration][-self.NUM_CAMERAS :]
+            self._newest = FrameFactory(calibration, self._width, rectified=first.pinhole)
+        return self._newest
+
+
 def _size(image: NDArray[Any]) -> str:
     return f'{image.shape[1]}x{image.shape[0]}'
 

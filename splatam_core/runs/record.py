@@ -43,6 +43,9 @@ class Source:
         crop: pixels cut off each edge of the frames.
         split: train or test, where a dataset has both.
         skip_bad: True if frames that the dataset flags as bad were skipped.
+        max_interval_s: largest difference between the stamps of colour and depth; None = left to the reader.
+        use_receive_time: True if the times of recording were taken for stamps.
+        rgb_encoding: how images of encoding 8UC3 were read; None = as bgr8.
     """
 
     path: str
@@ -57,6 +60,9 @@ class Source:
     crop: int = 0
     split: str | None = None
     skip_bad: bool = False
+    max_interval_s: float | None = None
+    use_receive_time: bool = False
+    rgb_encoding: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

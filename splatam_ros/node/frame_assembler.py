@@ -7,12 +7,12 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
-from msg_adapters import camera_info, images, stamps
+from msg_adapters import camera_info, images, remarks, stamps
 from msg_adapters.camera_info import CameraParameters
 from msg_adapters.synchronizer import RgbdSet, RgbdSynchronizer, SyncStatistics
 from splatam_core.geometry.camera import CameraCalibration
 from splatam_core.geometry.trajectory import stamp_text
-from splatam_core.images.rectification import FrameFactory
+from splatam_core.images.rectification import FrameFactories, FrameFactory
 from splatam_core.types import RgbdFrame
 from splatam_ros.node.gate import FrameGate
 from splatam_ros.node.parameters import NodeOptions
@@ -20,7 +20,6 @@ from splatam_ros.node.stamp_filter import StampFilter
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 T = TypeVar('T')
-LARGE_GAP_NS = 20_000_000  # rtabmap_ros warns from the same gap
 
 
 class FrameAssembler:
@@ -39,16 +38,17 @@ class FrameAssembler:
         """
         jump_ns = round(options.time_jump_threshold * 1e9)
         self._synchronizer = RgbdSynchronizer(
-            options.sync_mode, round(options.sync_max_interval * 1e9), options.sync_queue_size, jump_ns
+            options.sync_mode, round(options.sync_max_interval * 1e9) or None, options.sync_queue_size, jump_ns
         )
         self._stamps = StampFilter(jump_ns, self._drop_wrong_stamp)
-        self._width = options.width or None
+        self._factories = FrameFactories(options.width or None)
+        self._has_k = False
         self._is_rectified = not options.undistort
-        self._decode_depth = partial(images.decode_depth, metres_per_count=options.depth_scale)
+        self._depth_scale = options.depth_scale
+        self._rgb_encoding = options.rgb_encoding or None
         self._warnings = warnings
         self._gate = gate
         self._on_rejected = on_rejected
-        self._factory: FrameFactory | None = None
         self._reported = self._synchronizer.statistics
 
     @property
@@ -75,6 +75,13 @@ class FrameAssembler:
         parameters = self._attempt('CameraInfo', read, message)
         if parameters is None:
             return []
+        if not self._is_rectified and camera_info.has_only_p(message):
+            if self._has_k:
+                self._warnings.warn('CameraInfo', 'CameraInfo skipped: K is all zero')
+                return []
+            self._remark('info', remarks.on_info(message))
+        else:
+            self._has_k = True
         return self._frames(self._synchronizer.add_info(stamps.message_stamp_ns(message), parameters))
 
     def flush(self) -> list[RgbdFrame]:
@@ -117,34 +124,27 @@ class FrameAssembler:
 
     def _frame(self, found: RgbdSet) -> RgbdFrame | None:
         factory = self._attempt('camera', self._frame_factory, found.info)
-        rgb = self._attempt('colour', images.decode_color, found.color)
-        depth_m = self._attempt('depth', self._decode_depth, found.depth)
+        size = found.info.width, found.info.height
+        decode_color = partial(images.decode_color, camera_size=size, rgb_encoding=self._rgb_encoding)
+        decode_depth = partial(images.decode_depth, metres_per_count=self._depth_scale, camera_size=size)
+        rgb = self._attempt('colour', decode_color, found.color)
+        depth_m = self._attempt('depth', decode_depth, found.depth)
         if factory is None or rgb is None or depth_m is None:
             return None
-        self._warn_of_mismatch(found)
+        self._remark('gap', remarks.on_gap(found.gap_ns))
+        self._remark('frame ids', remarks.on_frames(found.color.header.frame_id, found.depth.header.frame_id))
+        self._remark('encoding', remarks.on_encoding(getattr(found.color, 'encoding', ''), self._rgb_encoding))
         frame = self._attempt('frame', lambda stamp_ns: factory.make(stamp_ns, rgb, depth_m), found.stamp_ns)
         if frame is None:
             return None
         return replace(frame, epoch=found.resets, frame_id=found.color.header.frame_id or found.info.frame_id)
 
-    def _warn_of_mismatch(self, found: RgbdSet) -> None:
-        if abs(found.gap_ns) > LARGE_GAP_NS:
-            self._warnings.warn(
-                'gap', f'depth is {found.gap_ns / 1e9:+.3f} s from its colour: a moving camera will smear the map; '
-                'synchronize the two in the driver, or lower sync.max_interval',
-            )  # fmt: skip
-        color, depth = found.color.header.frame_id, found.depth.header.frame_id
-        if color != depth and color and depth:
-            self._warnings.warn(
-                'frame ids', f"depth is in frame '{depth}', colour in '{color}': depth must be registered to colour; "
-                'if it is not, use the depth that the driver aligns (RealSense: aligned_depth_to_color)',
-            )  # fmt: skip
+    def _remark(self, kind: str, text: str) -> None:
+        if text:
+            self._warnings.warn(kind, text)
 
     def _frame_factory(self, parameters: CameraParameters) -> FrameFactory:
-        calibration = CameraCalibration.from_intrinsics(parameters)
-        if self._factory is None or self._factory.calibration != calibration:
-            self._factory = FrameFactory(calibration, self._width)
-        return self._factory
+        return self._factories.of(CameraCalibration.from_intrinsics(parameters))
 
     def _attempt(self, what: str, function: Callable[[Any], T], argument: Any) -> T | None:
         """Returns the function's result, or None after a warning if the input cannot be used."""

@@ -84,7 +84,7 @@ def why_no_frames(node: Node, inputs: Sequence[MonitoredSubscription], statistic
     if statistics.newest_gap_ns is not None:
         return (
             f'colour and depth are received, but nothing pairs: the stamps of the newest two are '
-            f'{abs(statistics.newest_gap_ns) / 1e9:.3f} s apart, and {_allowed(options)}'
+            f'{abs(statistics.newest_gap_ns) / 1e9:.3f} s apart, and {_allowed(options, statistics)}'
         )
     return 'no new images are received, or none that can be used; see the warnings'
 
@@ -109,10 +109,10 @@ def _transport(item: MonitoredSubscription) -> str:
     return 'rgb_transport' if 'rgb' in item.name else 'depth_transport'
 
 
-def _allowed(options: NodeOptions) -> str:
+def _allowed(options: NodeOptions, statistics: SyncStatistics) -> str:
     if options.sync_mode == 'exact':
         return 'sync.mode is exact; approximate allows sync.max_interval'
-    return f'sync.max_interval is {options.sync_max_interval:g} s'
+    return f'sync.max_interval is {statistics.max_interval_ns / 1e9:g} s'
 
 
 def _topics(inputs: Sequence[MonitoredSubscription]) -> str:

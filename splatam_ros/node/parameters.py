@@ -81,12 +81,15 @@ NODE_SETTINGS: tuple[Setting, ...] = (
              choices=('raw', 'compressedDepth')),
     _setting('depth_scale', 0.001, 'Length of one step of 16-bit depth images. Drivers send millimetres (0.001), some '
              'recordings other steps (TUM PNG files: 0.0002).', 'm', 1e-6, 1.0),
+    _setting('rgb_encoding', '', 'How to read images of encoding 8UC3 or 8UC4, which do not say the order of the channels; empty '
+             '= bgr8, with a warning.', choices=('', 'bgr8', 'rgb8')),
     _setting('undistort', True, 'Undistort images by K and D of CameraInfo; false = the images are rectified (image_rect), '
              'and P is their camera.'),
     _setting('sync.mode', 'approximate', 'How colour and depth are paired: by equal stamps, or by the nearest stamps.',
              choices=('exact', 'approximate')),
-    _setting('sync.max_interval', 0.02, 'Largest difference between the stamps of a pair (approximate only). Increase when '
-             'nothing pairs; decrease when a moving camera smears the map.', 's', 0.0, 10.0),
+    _setting('sync.max_interval', 0.0, 'Largest difference between the stamps of a pair (approximate only); 0 = half the time '
+             'between colour images, but 0.02 to 0.05. Increase when nothing pairs; decrease when a moving camera smears the map.',
+             's', 0.0, 10.0),
     _setting('sync.queue_size', 30, 'Number of colour and of depth images that can wait for a partner. Increase when one '
              'stream arrives much later than the other.', '', 1, 1000),
     _setting('on_time_jump', 'reset', 'What to do when stamps jump back, e.g. when a recording loops: reset = start a new map, '
@@ -150,6 +153,7 @@ class NodeOptions:
     rgb_transport: str
     depth_transport: str
     depth_scale: float
+    rgb_encoding: str
     undistort: bool
     sync_mode: Mode
     sync_max_interval: float

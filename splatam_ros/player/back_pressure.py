@@ -61,15 +61,16 @@ class BackPressure:
         self._quiet_s = QUIET_S
         self._color: Publisher | None = None
 
-    def count_frames(self, color: Publisher | None, *, has_depth: bool) -> None:
+    def count_frames(self, color: Publisher | None, *, has_depth: bool, max_interval_ns: int | None) -> None:
         """Say which images are frames.
 
         Args:
             color: publishes the colour images; None if none are played.
             has_depth: True if depth images are played, which a frame then needs too.
+            max_interval_ns: largest distance of colour and depth of a frame; None adapts it to the rate.
         """
         self._color = color
-        self.backlog = Backlog(needs_depth=bool(self._answer_topics) and has_depth)
+        self.backlog = Backlog(bool(self._answer_topics) and has_depth, max_interval_ns)
 
     def notice_acknowledgements(self) -> None:
         """Count all frames as answered if no topic answers and everything has been acknowledged."""

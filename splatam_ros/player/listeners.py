@@ -68,7 +68,10 @@ class AnswerTopic:
         return cls
 
     def _receive(self, data: bytes) -> None:
-        self._on_answer(serialized_stamp_ns(data))
+        try:
+            self._on_answer(serialized_stamp_ns(data))
+        except MessageError as error:
+            self._node.get_logger().warning(f'an answer on {self.name} is ignored: {error}', throttle_duration_sec=10.0)
 
 
 class Listeners:

@@ -97,6 +97,8 @@ def _add_back_pressure(parser: argparse.ArgumentParser) -> None:
         f'(default: {ANSWER_TOPICS[0]}, and {ANSWER_TOPICS[1]} for frames without a pose)',
     )  # fmt: skip
     add('--max-ahead', type=_count, default=2, metavar='N', help='the N of --wait-for (default: %(default)s)')
+    add('--max-interval', type=_seconds, default=0.0, metavar='S', help="the node's sync.max_interval: colour and depth of a "
+        'frame are at most S seconds apart (default: 0 = by the rate, as the node)')  # fmt: skip
     add('--wait-timeout', type=_positive, default=60.0, metavar='S', help='longest wait for an answer (default: 60 s)')
     add(
         '--wait-for-all-acked', type=_seconds, metavar='MS',

@@ -8,10 +8,12 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 from splatam_core.datasets.bag.recording import Recording
+from splatam_core.datasets.bag.typestore import IMAGES
 from splatam_ros.player.offered_qos import Policies, read_overrides
 from splatam_ros.player.playable import PlayableTopics
 from splatam_ros.process import RosError
 
+LONG_SILENCE_NS = 24 * 3600 * 10**9  # from the first message to the first image
 ANSWER_TOPICS = ('/splatam/pose', '/splatam/processed')
 """Where ``splatam_node`` answers frames: those that get a pose, and those that get none."""
 
@@ -41,6 +43,8 @@ class Options:
         acknowledge_timeout_s: longest wait, at the end, until subscribers have received everything.
         wait_for_subscribers: True to wait until the images have subscribers, and to stop when these leave.
         discovery_timeout_s: longest wait for subscribers and for the answer topic.
+        max_interval_ns: largest distance of the colour and depth image of a frame, as the node pairs them; None adapts it to the
+            rate.
     """
 
     topics: tuple[str, ...]
@@ -62,6 +66,7 @@ class Options:
     acknowledge_timeout_s: float
     wait_for_subscribers: bool
     discovery_timeout_s: float
+    max_interval_ns: int | None
 
 
 def make_options(args: argparse.Namespace, recording: Recording, playable: PlayableTopics) -> Options:
@@ -102,6 +107,7 @@ def make_options(args: argparse.Namespace, recording: Recording, playable: Playa
         acknowledge_timeout_s=_acknowledge_timeout_s(args),
         wait_for_subscribers=not args.no_wait_for_subscribers,
         discovery_timeout_s=args.discovery_timeout,
+        max_interval_ns=round(args.max_interval * 1e9) or None,
     )
 
 
@@ -135,9 +141,10 @@ def _is_asked_for(name: str, topics: Collection[str] | None, regex: re.Pattern[s
 
 def _cut(args: argparse.Namespace, recording: Recording) -> tuple[int, int]:
     """Returns the recording times of start and end."""
-    if args.start_offset > recording.duration_s:
-        raise RosError(f'--start-offset {args.start_offset:g}: the recording lasts {recording.duration_s:.1f} s')
-    start_ns = recording.start_ns + round(args.start_offset * 1e9)
+    duration_s = (recording.end_ns - _first_ns(recording)) / 1e9
+    if args.start_offset > duration_s:
+        raise RosError(f'--start-offset {args.start_offset:g}: the recording lasts {duration_s:.1f} s')
+    start_ns = _first_ns(recording) + round(args.start_offset * 1e9)
     end_ns = recording.end_ns
     if args.duration is not None:
         end_ns = min(end_ns, start_ns + round(args.duration * 1e9))
@@ -146,6 +153,17 @@ def _cut(args: argparse.Namespace, recording: Recording) -> tuple[int, int]:
     if end_ns < start_ns:
         raise RosError(f'--playback-until {args.until_ns / 1e9:.9f} s: playback starts at {start_ns / 1e9:.9f} s of the recording')
     return start_ns, end_ns
+
+
+def _first_ns(recording: Recording) -> int:
+    """Returns the time of recording at which a recording begins.
+
+    RealSense Viewer records camera infos at time 0, and images at the time of day. The images then are the beginning.
+    """
+    images = recording.topics_of(*IMAGES)
+    first = next(recording.messages(images), None) if images else None
+    is_long = first is not None and first.time_ns - recording.start_ns > LONG_SILENCE_NS
+    return first.time_ns if first is not None and is_long else recording.start_ns
 
 
 def _acknowledge_timeout_s(args: argparse.Namespace) -> float:

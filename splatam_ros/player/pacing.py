@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from msg_adapters.interval import PairInterval
 from splatam_core.geometry.trajectory import stamp_text
 
 
@@ -119,16 +120,17 @@ class Backlog:
     A colour image without depth image in the recording is no frame, because the node cannot answer it.
     """
 
-    PAIR_WITHIN_NS = 20_000_000  # the node's sync.max_interval
     NUM_DEPTHS = 100  # depth stamps remembered; messages of one instant are close together in a recording
 
-    def __init__(self, needs_depth: bool) -> None:
+    def __init__(self, needs_depth: bool, max_interval_ns: int | None = None) -> None:
         """Start empty.
 
         Args:
             needs_depth: True if a colour image is a frame only with its depth image.
+            max_interval_ns: largest distance of the two, the node's ``sync.max_interval``; None adapts it to the rate, as the node.
         """
         self.num_colors = 0
+        self._interval = PairInterval(max_interval_ns)
         self._num_unpaired = 0
         self._needs_depth = needs_depth
         self._unanswered: deque[PublishedColor] = deque()
@@ -152,6 +154,7 @@ class Backlog:
     def color(self, stamp_ns: int) -> None:
         """Record that a colour image was published."""
         self.num_colors += 1
+        self._interval.add_color(stamp_ns)
         is_complete = not self._needs_depth or any(self._pairs(stamp_ns, depth_ns) for depth_ns in self._depths_ns)
         self._unanswered.append(PublishedColor(self.num_colors, stamp_ns, is_complete))
 
@@ -178,4 +181,4 @@ class Backlog:
         self._depths_ns.clear()
 
     def _pairs(self, color_ns: int, depth_ns: int) -> bool:
-        return abs(color_ns - depth_ns) <= self.PAIR_WITHIN_NS
+        return abs(color_ns - depth_ns) <= self._interval.ns

@@ -12,6 +12,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import ReliabilityPolicy
 from tqdm import tqdm
 
+from msg_adapters.errors import MessageError
 from msg_adapters.factory import message_class
 from msg_adapters.stamps import serialized_stamp_ns
 from splatam_core.datasets.bag.recording import RawMessage, RecordedTopic, Recording
@@ -31,6 +32,7 @@ STEP_S = 0.05  # longest time without a look at keys and signals
 CHECK_GRAPH_S = 0.2
 LATE_SUBSCRIBERS_S = 5.0  # after the first image topic has a subscriber; discovery takes up to 3 s
 LINGER_S = 0.5  # at the end, for subscribers that acknowledge nothing: what they have not received is lost when we exit
+SHORTEST_MESSAGE = 4  # bytes of the CDR encapsulation
 BAR_FORMAT = '{percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s of the recording [{elapsed}<{remaining}{postfix}]'
 
 
@@ -75,7 +77,7 @@ class Player:
         self._color: str | None = None
         self._depth: str | None = None
         self._lateness = Lateness()
-        self._num_messages = 0
+        self._num_messages = self._num_damaged = 0
         self._check_graph_due_s = 0.0
         self._bar: tqdm | None = None
 
@@ -146,7 +148,7 @@ class Player:
         if self._color is None and (self._answer_topics or self._options.rate is None):
             raise RosError('--wait-for and --rate max count colour images, and none are played')
         color = None if self._color is None else self._publishers[self._color]
-        self._back_pressure.count_frames(color, has_depth=self._depth is not None)
+        self._back_pressure.count_frames(color, has_depth=self._depth is not None, max_interval_ns=self._options.max_interval_ns)
 
     def _wait_for_answer_topic(self) -> None:
         for topic in self._answer_topics[:1]:
@@ -182,7 +184,7 @@ class Player:
         self._back_pressure.backlog.restart()
         self._sim_clock.restart()
         self._clock.restart(self._options.start_ns)
-        self._publish_latched()
+        self._publish_earlier()
         self._rest(self._options.delay_s)
         with closing(self._messages()) as messages:
             for message in messages:
@@ -210,11 +212,18 @@ class Player:
                 else:
                     self._step(0.0)
 
-    def _publish_latched(self) -> None:
-        """Publish latched messages (such as ``/tf_static``) from before the start: they still hold at the start."""
-        latched = [name for name in self._options.topics if is_latched(self._recording.topics[name])]
-        for message in self._recording.messages(latched, None, self._options.start_ns):
-            self._publishers[message.topic].publish(message.data)
+    def _publish_earlier(self) -> None:
+        """Publish messages from before the start that still hold: latched ones (such as ``/tf_static``), and the last camera infos.
+
+        Some recorders write a camera info only once.
+        """
+        topics = [self._recording.topics[name] for name in self._options.topics]
+        latched = [topic.name for topic in topics if is_latched(topic)]
+        infos = [topic.name for topic in topics if topic.type_name == CAMERA_INFO and topic.name not in latched]
+        start_ns = self._options.start_ns
+        for message in (*self._recording.messages(latched, None, start_ns), *self._recording.last_before(infos, start_ns)):
+            if len(message.data) >= SHORTEST_MESSAGE:
+                self._publishers[message.topic].publish(message.data)
 
     def _wait_until_due(self, time_ns: int) -> None:
         self._step(self._clock.seconds_until(time_ns))
@@ -228,17 +237,31 @@ class Player:
 
     def _publish(self, message: RawMessage) -> None:
         self._sim_clock.before_message(message.topic, message.time_ns)
+        if len(message.data) < SHORTEST_MESSAGE:
+            self._num_damaged += 1
+            return
         if not self._controls.is_paused:
             self._lateness.add(-self._clock.seconds_until(message.time_ns))
         self._publishers[message.topic].publish(message.data)
         self._num_messages += 1
         self._clock.published(message.time_ns)
-        if message.topic == self._color:
-            self._back_pressure.backlog.color(serialized_stamp_ns(message.data))
-        elif message.topic == self._depth:
-            self._back_pressure.backlog.depth(serialized_stamp_ns(message.data))
+        self._count(message)
         if self._bar is not None:
             self._bar.update((message.time_ns - self._options.start_ns) / 1e9 - self._bar.n)
+
+    def _count(self, message: RawMessage) -> None:
+        """Count an image; the node does not answer one whose stamp is damaged."""
+        if message.topic not in (self._color, self._depth):
+            return
+        try:
+            stamp_ns = serialized_stamp_ns(message.data)
+        except MessageError:
+            self._num_damaged += 1
+            return
+        if message.topic == self._color:
+            self._back_pressure.backlog.color(stamp_ns)
+        else:
+            self._back_pressure.backlog.depth(stamp_ns)
 
     def _finish(self) -> None:
         """Wait until the last frame is answered and the last message has arrived."""
@@ -260,6 +283,7 @@ class Player:
             f'played {self._num_messages} messages in {seconds:.1f} s, '
             f'{self._back_pressure.backlog.num_colors} of them colour images'
             + (f'; {unpaired} of those have no depth image in the recording' if unpaired else '')
+            + (f'; {self._num_damaged} messages are damaged' if self._num_damaged else '')
             + (f'; 95 % of all at most {late_ms:.1f} ms late' if self._clock.rate and late_ms is not None else '')
         )
 

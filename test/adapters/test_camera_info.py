@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from msg_adapters import remarks
 from msg_adapters.camera_info import CameraParameters, info_message, parameters
 from msg_adapters.errors import MessageError
 from msg_adapters.stamps import message_stamp_ns
@@ -56,7 +57,9 @@ def test_no_distortion_is_said_as_rectified_ros_cameras_say_it(info):
     assert list(info().d) == [0.0] * 5
 
 
-@pytest.mark.parametrize('model', ['', 'none', 'pinhole', 'plumb_bob', 'rational_polynomial', 'equidistant'])
+@pytest.mark.parametrize(
+    'model', ['', 'none', 'None', 'pinhole', 'plumb_bob', 'rational_polynomial', 'equidistant', 'kannala', 'Inverse Brown Conrady']
+)
 @pytest.mark.parametrize('d', [[], [0.0] * 4, [0.0] * 5, [0.0] * 8])
 def test_zero_coefficients_are_no_distortion(info, model, d):
     camera = parameters(info(distortion_model=model, d=d))
@@ -80,7 +83,7 @@ def test_missing_coefficients_are_zero_and_zeros_too_many_are_dropped(info, mode
     ('model', 'd', 'said'),
     [
         ('kannala', [0.1, 0.0, 0.0, 0.0], "'kannala'"),
-        ('kannala', [0.0], "'kannala'"),
+        ('None', [0.1], "'None'"),
         ('none', [0.1], "'none'"),
         ('plumb_bob', [0.1, 0.0, 0.0, 0.0, 0.0, 0.2], 'has 5 coefficients'),
         ('equidistant', [0.1, 0.0, 0.0, 0.0, 0.2], 'has 4 coefficients'),
@@ -104,8 +107,37 @@ def test_distortion_that_is_not_understood_is_an_error(info, model, d, said):
 )
 def test_a_camera_without_calibration_is_one_line_of_error(info, k):
     with pytest.raises(MessageError, match='not calibrated') as caught:
-        parameters(info(k=np.array(k)))
+        parameters(info(k=np.array(k), p=np.zeros(12)))
     assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(('model', 'same'), [
+    ('Brown Conrady', 'plumb_bob'), ('inverse brown_conrady', 'plumb_bob'), ('Plumb Bob', 'plumb_bob'),
+    ('Kannala-Brandt4', 'equidistant'), ('RATIONAL_POLYNOMIAL', 'rational_polynomial'),
+])  # fmt: skip
+def test_other_names_of_the_same_models(info, model, same):
+    assert parameters(info(distortion_model=model, d=[0.1, 0.2, 0.3, 0.4])).distortion_model == same
+
+
+def test_a_camera_with_only_p_is_taken_as_rectified_and_said(info):
+    p = [400.0, 0.0, 310.0, 0.0, 0.0, 410.0, 230.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    message = info(k=np.zeros(9), p=p, d=[0.1, 0.0, 0.0, 0.0, 0.0])
+    camera = parameters(message)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion) == (400.0, 410.0, 310.0, 230.0, ())
+    assert 'P is used' in remarks.on_info(message)
+    assert remarks.on_info(info()) == '' == remarks.on_info(info(k=np.zeros(9), p=np.zeros(12)))
+
+
+@pytest.mark.parametrize(('changes', 'said'), [
+    ({'width': 40000, 'height': 2}, '40000x2'),
+    ({'width': 16000, 'height': 16000}, '67108864 pixels'),
+    ({'width': 2**32 - 1, 'height': 2**32 - 1}, '4294967295x4294967295'),
+    ({'k': np.array([525.0, 0.0, 1e300, 0.0, 525.0, 239.5, 0.0, 0.0, 1.0])}, 'in pixels'),
+    ({'k': np.array([1e9, 0.0, 319.5, 0.0, 525.0, 239.5, 0.0, 0.0, 1.0])}, 'in pixels'),
+])  # fmt: skip
+def test_a_camera_that_cannot_be_is_an_error(info, changes, said):
+    with pytest.raises(MessageError, match=said):
+        parameters(info(**changes))
 
 
 @pytest.mark.parametrize('changes', [{'width': 0}, {'height': 0}])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zlib
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from numpy.testing import assert_array_equal
 from rosbags.typesys import Stores, get_typestore
 
-from msg_adapters import images, stamps
+from msg_adapters import images, remarks, stamps
 from msg_adapters.errors import MessageError
 from msg_adapters.factory import RosbagsMessages
 
@@ -130,6 +131,26 @@ def test_decoded_images_do_not_share_the_messages_memory(factory):
 def test_channel_orders(factory, encoding, channels, padding):
     message = raw_message(factory, random_rgb()[..., channels], encoding, padding=padding)
     assert_array_equal(images.decode_color(message), random_rgb())
+
+
+@pytest.mark.parametrize(
+    ('encoding', 'stated', 'channels', 'read_as'),
+    [
+        ('8UC3', None, [2, 1, 0], 'bgr8'), ('8UC3', 'bgr8', [2, 1, 0], ''), ('8UC3', 'rgb8', [0, 1, 2], ''),
+        ('8UC4', None, [2, 1, 0, 1], 'bgra8'), ('8UC4', 'rgb8', [0, 1, 2, 0], ''), ('rgb8', None, [0, 1, 2], ''),
+        ('rgb8', 'bgr8', [0, 1, 2], ''),
+    ],
+)  # fmt: skip
+def test_encodings_that_do_not_say_the_order_of_channels(factory, encoding, stated, channels, read_as):
+    message = raw_message(factory, random_rgb()[..., channels], encoding)
+    assert_array_equal(images.decode_color(message, rgb_encoding=stated), random_rgb())
+    remark = remarks.on_encoding(encoding, stated)
+    assert bool(remark) == bool(read_as) and read_as in remark
+
+
+def test_8uc1_is_grey(factory):
+    decoded = images.decode_color(raw_message(factory, random_rgb()[..., 0], '8UC1'))
+    assert_array_equal(decoded, np.stack([random_rgb()[..., 0]] * 3, axis=-1))
 
 
 @pytest.mark.parametrize('pattern', ['rggb', 'bggr', 'gbrg', 'grbg'])
@@ -268,7 +289,8 @@ def test_truncated_compressed_depth_is_an_error(factory, length):
 @pytest.mark.parametrize(
     ('image_format', 'data', 'said'),
     [
-        ('16UC1; compressedDepth rvl', b'x' * 40, 'only png'),
+        ('16UC1; compressedDepth rvl', b'x' * 40, 'depth image is 2021161080x2021161080'),
+        ('16UC1; compressedDepth rvl', b'x' * 12 + bytes(7), 'RVL depth image has 7 bytes'),
         ('8UC1; compressedDepth png', bytes(12) + png(np.ones((2, 2), np.uint16)), 'must begin with'),
         ('16UC1; compressedDepth png', bytes(12) + png(np.ones((2, 2), np.uint8)), '16-bit'),
         ('16UC1; compressedDepth png', bytes(12) + png(np.ones((2, 2, 3), np.uint16)), '16-bit'),
@@ -279,6 +301,77 @@ def test_truncated_compressed_depth_is_an_error(factory, length):
 def test_compressed_data_that_are_no_depth(factory, image_format, data, said):
     with pytest.raises(MessageError, match=said):
         images.decode_depth(compressed_message(factory, image_format, data))
+
+
+# Sizes and orientations that headers state
+
+
+def with_exif(jpeg, orientation):
+    exif = b'Exif\0\0II*\0\x08\0\0\0' + struct.pack('<HHHIII', 1, 0x112, 3, 1, orientation, 0)
+    return jpeg[:2] + b'\xff\xe1' + struct.pack('>H', len(exif) + 2) + exif + jpeg[2:]
+
+
+def jpeg_of_size(width, height):
+    """A small JPEG whose header states another size."""
+    data = cv2.imencode('.jpg', smooth_rgb())[1].tobytes()
+    start = data.index(b'\xff\xc0') + 5
+    return data[:start] + struct.pack('>HH', height, width) + data[start + 4 :]
+
+
+def png_of_size(width, height, pixels=None):
+    data = png(random_rgb() if pixels is None else pixels)
+    header = b'IHDR' + struct.pack('>II', width, height) + data[24:29]
+    return data[:12] + header + struct.pack('>I', zlib.crc32(header)) + data[33:]
+
+
+@pytest.mark.parametrize('orientation', range(1, 9))
+def test_pixels_are_read_as_stored_whatever_orientation_a_jpeg_states(factory, orientation):
+    plain = cv2.imencode('.jpg', smooth_rgb()[..., ::-1])[1].tobytes()
+    decoded = images.decode_color(compressed_message(factory, 'jpeg', with_exif(plain, orientation)))
+    assert_array_equal(decoded, images.decode_color(compressed_message(factory, 'jpeg', plain)))
+
+
+@pytest.fixture
+def no_decoder(monkeypatch):
+    monkeypatch.setattr(cv2, 'imdecode', lambda *_: pytest.fail('decoded before its size was checked'))
+
+
+@pytest.mark.usefixtures('no_decoder')
+@pytest.mark.parametrize('size', [(40000, 40000), (65500, 65500), (20000, 20000), (40000, 2), (0, 8), (16384, 16384)])
+def test_an_image_that_states_an_impossible_size_is_not_decoded(factory, size):
+    width, height = size
+    for data in (jpeg_of_size(width, height), png_of_size(width, height)):
+        with pytest.raises(MessageError, match=f'colour image is {width}x{height}; both sides must be'):
+            images.decode_color(compressed_message(factory, 'jpeg', data))
+    counts = np.ones((4, 4), np.uint16)
+    data = bytes(12) + png_of_size(width, height, counts)
+    with pytest.raises(MessageError, match=f'depth image is {width}x{height}'):
+        images.decode_depth(compressed_message(factory, '16UC1; compressedDepth png', data))
+
+
+@pytest.mark.usefixtures('no_decoder')
+def test_an_image_of_another_size_than_the_cameras_is_not_decoded(factory):
+    for data in (jpeg_of_size(64, 49), png_of_size(65, 48)):
+        with pytest.raises(MessageError, match='but the camera is calibrated for 64x48'):
+            images.decode_color(compressed_message(factory, 'jpeg', data), camera_size=(64, 48))
+    depth = bytes(12) + png_of_size(64, 48, np.ones((4, 4), np.uint16))
+    with pytest.raises(MessageError, match='more than 4 times as large as the 15x12 images'):
+        images.decode_depth(compressed_message(factory, '16UC1; compressedDepth png', depth), camera_size=(15, 12))
+
+
+def test_the_size_is_found_behind_other_segments_and_fill_bytes(factory):
+    data = cv2.imencode('.jpg', smooth_rgb())[1].tobytes()
+    comment = b'\xff\xfe' + struct.pack('>H', 10) + b'\xff\xc0\x00\x11\x08abc'  # what looks like a size, in a comment
+    message = compressed_message(factory, 'jpeg', data[:2] + comment + b'\xff\xff' + data[2:])
+    assert images.decode_color(message, camera_size=(64, 48)).shape == (48, 64, 3)
+
+
+def test_a_whole_header_before_damaged_pixels_is_an_error(factory):
+    data = jpeg_of_size(100, 30)
+    try:
+        assert images.decode_color(compressed_message(factory, 'jpeg', data)).shape == (30, 100, 3)  # lenient decoders fill up
+    except MessageError as error:
+        assert 'truncated or damaged' in str(error)
 
 
 def test_compressed_depth_is_no_colour(factory):
@@ -296,7 +389,7 @@ def test_an_encoding_of_the_other_kind_is_an_error_that_lists_the_supported(fact
     assert '\n' not in str(caught.value)
 
 
-@pytest.mark.parametrize('encoding', ['', 'RGB8', 'rgb16', '8UC3', 'nv21'])
+@pytest.mark.parametrize('encoding', ['', 'RGB8', 'rgb16', '8UC2', 'nv21'])
 def test_an_unknown_encoding_is_an_error(factory, encoding):
     with pytest.raises(MessageError, match=f"'{encoding}'"):
         images.decode_color(raw_message(factory, random_rgb(), encoding))

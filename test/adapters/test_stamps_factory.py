@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -9,7 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from msg_adapters import stamps
 from msg_adapters.errors import MessageError
-from msg_adapters.factory import RosbagsMessages
+from msg_adapters.factory import RosbagsMessages, message_class
 
 
 @given(st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
@@ -23,6 +25,30 @@ def test_a_stamp_splits_into_seconds_and_nanoseconds_without_loss(stamp_ns):
 def test_a_stamp_beyond_32_bit_seconds_is_an_error(stamp_ns):
     with pytest.raises(MessageError, match='32-bit'):
         stamps.from_ns(stamp_ns)
+
+
+@pytest.mark.parametrize(('sec', 'nanosec'), [(2147483647, 4294967295), (1, 10**9), (0, 2**32 - 1)])
+def test_a_stamp_out_of_range_is_an_error(factory, sec, nanosec):
+    stamp = factory.make('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
+    with pytest.raises(MessageError, match=f'stamp with sec {sec} and nanosec {nanosec}'):
+        stamps.to_ns(stamp)
+    header = factory.make('std_msgs/msg/Header', stamp=stamp, frame_id='')
+    message = factory.make(
+        'geometry_msgs/msg/PointStamped', header=header, point=factory.make('geometry_msgs/msg/Point', x=0.0, y=0.0, z=0.0)
+    )
+    with pytest.raises(MessageError, match='stamp with sec'):
+        stamps.message_stamp_ns(message)
+    with pytest.raises(MessageError, match='stamp with sec'):
+        stamps.serialized_stamp_ns(b'\0\1\0\0' + struct.pack('<iI', sec, nanosec))
+
+
+@pytest.mark.parametrize(
+    'name', ['.x/msg/Foo', '..std_msgs/msg/Header', 'std_msgs/msg/', '/msg/Foo', 'a b/msg/C', 'std_msgs/msg/__name__',
+             'std_msgs/msg/_header', 'std\0msgs/msg/A', 'x' * 5000 + '/msg/A']
+)  # fmt: skip
+def test_a_name_that_is_no_type_is_an_error(name):
+    with pytest.raises(MessageError, match='message type'):
+        message_class(name)
 
 
 def test_a_header_keeps_stamp_and_frame(factory):

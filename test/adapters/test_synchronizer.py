@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from msg_adapters.interval import PairInterval
 from msg_adapters.pairing import Key, first_pair
 from msg_adapters.synchronizer import RgbdSynchronizer
 
@@ -419,3 +420,45 @@ def test_no_two_neighbours_could_have_had_each_other(color, depth, interval):
         left_color = [c for c in color if c0 < c < c1]
         left_depth = [d for d in depth if d0 < d < d1]
         assert not [(c, d) for c in left_color for d in left_depth if abs(c - d) <= interval]
+
+
+# --- an interval that adapts to the rate ---
+
+
+@pytest.mark.parametrize(('rate_hz', 'expected_ms'), [(60, 20), (30, 20), (15, 33), (10, 50), (2, 50)])
+def test_the_interval_is_half_the_time_between_colour_images_but_20_to_50_ms(rate_hz, expected_ms):
+    interval = PairInterval(None)
+    assert interval.ns == 20 * MS
+    for i in range(20):
+        interval.add_color(i * SECOND // rate_hz)
+    assert interval.ns // MS == expected_ms
+    fixed = PairInterval(7)
+    fixed.add_color(0)
+    fixed.add_color(SECOND)
+    assert fixed.ns == 7
+
+
+def test_lost_images_and_jumps_back_do_not_change_the_interval():
+    interval = PairInterval(None)
+    for stamp in (0, 66, 132, 198, 398, 464, 530, 0, 66, 132):
+        interval.add_color(stamp * MS)
+    assert interval.ns == 33 * MS
+
+
+def test_depth_that_is_late_by_more_than_20_ms_is_paired_at_15_hz():
+    feed = Feed('approximate', max_interval_ns=None)
+    for i in range(8):
+        feed.add('color', i * 66 * MS).add('depth', i * 66 * MS + 30 * MS)
+    feed.flush()
+    assert [depth - color for color, depth in feed.pairs] == [30 * MS] * 8
+    assert feed.statistics.max_interval_ns == 33 * MS
+    none = Feed('approximate')
+    for i in range(8):
+        none.add('color', i * 66 * MS).add('depth', i * 66 * MS + 30 * MS)
+    assert none.flush().pairs == []
+
+
+def test_exact_mode_does_not_adapt():
+    feed = Feed('exact', max_interval_ns=None)
+    feed.add('color', 0, 66 * MS).add('depth', 1, 66 * MS).flush()
+    assert feed.pairs == [(66 * MS, 66 * MS)]

@@ -450,7 +450,7 @@ def test_depth_scale_is_for_counts_not_for_metres(tmp_path):
 
 def test_uncalibrated_camera(tmp_path):
     message = info(SECOND)
-    message.k[:] = 0
+    message.k[:] = message.p[:] = 0
     with pytest.raises(CameraError, match=r'/camera/color/camera_info: CameraInfo K'):
         messages = [('/camera/color/camera_info', SECOND, message), *rgbd(SECOND)[1:]]
         open_sequence(str(make_bag(tmp_path / 'bag', messages)))
@@ -500,33 +500,31 @@ def test_empty_bag(tmp_path, storage):
 @pytest.mark.parametrize('storage', STORAGES)
 @pytest.mark.parametrize('kept', [0.0, 0.001, 0.3, 0.7, 0.98])
 @pytest.mark.parametrize('as_file', [False, True])
-def test_truncated_bag(tmp_path, storage, kept, as_file):
-    """A bag cut anywhere, opened as folder or as file, gives one error, and never fewer frames."""
-    write_bag(Frames([(i + 1) * 33 * MS for i in range(12)], 1000.0), tmp_path / 'bag', storage=storage)
+def test_truncated_bag(tmp_path, storage, kept, as_file, caplog):
+    """A bag cut anywhere, opened as folder or as file, gives one error, or the frames that are whole and a warning."""
+    written = Frames([(i + 1) * 33 * MS for i in range(12)], 1000.0, size=(16, 20))
+    write_bag(written, tmp_path / 'bag', storage=storage)
     (file,) = [path for path in (tmp_path / 'bag').iterdir() if path.suffix in ('.db3', '.mcap')]
     data = file.read_bytes()
     file.write_bytes(data[: int(kept * len(data))])
-    with pytest.raises(DatasetError) as caught:
+    try:
         sequence = open_sequence(str(file if as_file else tmp_path / 'bag'))
-        for frame in sequence:
-            assert frame
-    assert '\n' not in str(caught.value)
-    assert str(tmp_path / 'bag') in str(caught.value)
+    except DatasetError as error:
+        assert kept < 0.5 or storage == 'mcap'  # which has all images in one chunk here
+        assert '\n' not in str(error)
+        assert str(tmp_path / 'bag') in str(error)
+    else:
+        assert f'{file.name} is cut or damaged' in caplog.text
+        for index in range(len(sequence)):
+            assert_same(sequence[index], written[index])
 
 
-def test_recording_that_was_not_closed(tmp_path, room):
-    write_bag(room(width=32), tmp_path / 'bag')
-    (tmp_path / 'bag' / 'metadata.yaml').unlink()
-    with pytest.raises(DatasetError, match=r'no metadata\.yaml.*ros2 bag reindex bag" or open bag\.db3 itself'):
-        open_sequence(str(tmp_path / 'bag'))
-
-
-def test_messages_missing_from_what_the_bag_states(tmp_path, room):
+def test_messages_missing_from_what_the_bag_states(tmp_path, room, caplog):
     write_bag(room(width=32), tmp_path / 'bag')
     metadata = tmp_path / 'bag' / 'metadata.yaml'
     metadata.write_text(metadata.read_text().replace('message_count: 3', 'message_count: 4'))
-    with pytest.raises(DatasetError, match='has 3 messages of the 4 that the bag states'):
-        open_sequence(str(tmp_path / 'bag'))
+    assert len(open_sequence(str(tmp_path / 'bag'))) == 3
+    assert 'has 3 messages of the 4 that the bag states; is the copy complete?' in caplog.text
 
 
 @pytest.mark.parametrize('text', ['', '{}', 'rosbag2_bagfile_information: 3', ': :\n -'])
@@ -540,13 +538,3 @@ def test_broken_metadata(tmp_path, text):
 def test_no_bag_at_all(tmp_path):
     with pytest.raises(DatasetError, match='is an empty folder; rosbag expects a rosbag2 folder'):
         open_sequence(str(tmp_path), format='rosbag')
-
-
-def test_message_too_short_for_a_header(tmp_path):
-    with Writer(tmp_path / 'bag', version=9) as writer:
-        for topic, recorded_ns, message in rgbd(SECOND):
-            connection = writer.add_connection(topic, message.__msgtype__, typestore=TYPES)
-            writer.write(connection, recorded_ns, raw(message))
-        writer.write(writer.connections[1], SECOND, b'\0\1\0\0\0')
-    with pytest.raises(DatasetError, match='has 5 bytes, too few for a header'):
-        open_sequence(str(tmp_path / 'bag'))

@@ -128,12 +128,84 @@ def test_maps_are_computed_once_a_camera(make_bench: Callable[..., Bench], monke
 
 def test_camera_info_of_zeros_changes_nothing(make_bench: Callable[..., Bench]) -> None:
     bench = make_bench()
-    assert bench.feed(SECOND, info=info(k=[0.0] * 9)) == []  # waits for a valid one
+    zeros = {'k': [0.0] * 9, 'p': [0.0] * 12}
+    assert bench.feed(SECOND, info=info(**zeros)) == []  # waits for a valid one
     first, second = bench.feed(2 * SECOND)
     assert (first.stamp_ns, second.stamp_ns) == (SECOND, 2 * SECOND)
-    (frame,) = bench.feed(3 * SECOND, info=info(k=[0.0] * 9))
+    (frame,) = bench.feed(3 * SECOND, info=info(**zeros))
     assert frame.camera == first.camera
     assert 'CameraInfo skipped' in bench.said() and 'not calibrated' in bench.said()
+
+
+def test_p_is_used_until_there_is_a_k(make_bench: Callable[..., Bench]) -> None:
+    bench = make_bench()
+    only_p = info(k=[0.0] * 9, d=[0.1] * 5, p=[60.0, 0.0, 31.5, 0.0, 0.0, 60.0, 23.5, 0.0, 0.0, 0.0, 1.0, 0.0])
+    (frame,) = bench.feed(SECOND, info=only_p)
+    assert frame.camera.fx == 60.0 and 'P is used, and the images are taken as rectified' in bench.said()
+    (frame,) = bench.feed(2 * SECOND)
+    assert frame.camera.fx == 55.0
+    (frame,) = bench.feed(3 * SECOND, info=only_p)
+    assert frame.camera.fx == 55.0 and 'CameraInfo skipped: K is all zero' in bench.said()
+
+
+@pytest.mark.parametrize('model', ['None', 'kannala', ''])
+def test_any_model_without_coefficients_is_no_distortion(make_bench: Callable[..., Bench], model: str) -> None:
+    (frame,) = make_bench().feed(SECOND, info=info(distortion_model=model))
+    assert frame.camera.fx == 55.0
+
+
+def test_autofocus_does_not_change_the_camera_of_the_frames(make_bench: Callable[..., Bench]) -> None:
+    bench = make_bench()
+    frames = []
+    for i in range(4):
+        f = 55.0 + 0.3 * i
+        frames += bench.feed((1 + i) * SECOND, info=info(k=[f, 0.0, 31.5, 0.0, f, 23.5, 0.0, 0.0, 1.0]))
+    assert len(frames) == 4 and {frame.camera.fx for frame in frames} == {55.0}
+    (other,) = bench.feed(6 * SECOND, info=info(k=[90.0, 0.0, 31.5, 0.0, 90.0, 23.5, 0.0, 0.0, 1.0]))
+    assert other.camera.fx == 90.0
+    (back,) = bench.feed(7 * SECOND, info=info(k=[55.5, 0.0, 31.5, 0.0, 55.5, 23.5, 0.0, 0.0, 1.0]))
+    assert back.camera == frames[0].camera
+
+
+def test_images_that_do_not_say_the_order_of_channels(make_bench: Callable[..., Bench]) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, RGB.shape, np.uint8)
+
+    def feed(bench: Bench) -> RgbdFrame:
+        color = images.color_message(MAKE, rgb, SECOND, CAMERA_FRAME)
+        color.encoding = '8UC3'
+        bench.assembler.add_info(info())
+        bench.assembler.add_color(color)
+        (frame,) = bench.assembler.add_depth(images.depth_message(MAKE, DEPTH, SECOND, CAMERA_FRAME))
+        return frame
+
+    bench = make_bench(rgb_encoding='rgb8')
+    np.testing.assert_array_equal(feed(bench).rgb, rgb)
+    assert '8UC3' not in bench.said()
+    np.testing.assert_array_equal(feed(make_bench()).rgb, rgb[..., ::-1])
+    assert "encoding '8UC3'" in bench.said() and 'read as bgr8' in bench.said()
+
+
+def test_depth_of_a_slow_camera_may_be_later(make_bench: Callable[..., Bench]) -> None:
+    bench = make_bench()
+    frames = []
+    for i in range(6):
+        frames += bench.feed(SECOND + i * 66_000_000, depth_delay_ns=30_000_000)
+    assert len(frames + bench.assembler.flush()) == 6
+    assert 'depth is +0.030 s from its colour' in bench.said()
+
+
+def test_an_image_that_claims_a_huge_size_is_one_warning(make_bench: Callable[..., Bench]) -> None:
+    bench = make_bench()
+    jpeg = bytearray(cv2.imencode('.jpg', RGB)[1].tobytes())
+    size = jpeg.index(b'\xff\xc0') + 5
+    jpeg[size : size + 4] = struct.pack('>HH', 40000, 40000)
+    message = images.compressed_color_message(MAKE, RGB, SECOND, CAMERA_FRAME)
+    message.data = bytes(jpeg)
+    bench.assembler.add_info(info())
+    bench.assembler.add_color(message)
+    assert bench.assembler.add_depth(images.depth_message(MAKE, DEPTH, SECOND, CAMERA_FRAME)) == []
+    assert 'colour skipped: colour image is 40000x40000' in bench.said()
+    assert len(bench.feed(2 * SECOND)) == 1
 
 
 def test_depth_of_half_the_resolution_is_taken_other_shapes_are_refused(make_bench: Callable[..., Bench]) -> None:

@@ -3,38 +3,53 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from msg_adapters import camera_info, poses
+from msg_adapters import camera_info, poses, remarks
 from msg_adapters.errors import MessageError
 from msg_adapters.stamps import serialized_stamp_ns
 from msg_adapters.synchronizer import RgbdSet, RgbdSynchronizer
 from splatam_core.datasets.bag.recording import RawMessage, Recording
 from splatam_core.datasets.bag.topics import ChosenTopics
-from splatam_core.datasets.base import check_increasing
+from splatam_core.datasets.base import MAX_INTERVAL_S, check_increasing
 from splatam_core.errors import CameraError, DatasetError
 from splatam_core.geometry.camera import CameraCalibration
 from splatam_core.geometry.trajectory import Trajectory, stamp_text
 
-MAX_INTERVAL_NS = 20_000_000
 QUEUE_SIZE = 300  # ten seconds of one stream before the other begins
 JUMP_NS = 1_000_000_000
+MIN_STAMPS = 2
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class ImageEntry:
-    """A colour or depth message of the bag, without its image."""
+    """A colour or depth message of the bag, without its image.
+
+    Attributes:
+        topic: its topic.
+        recorded_ns: its time of recording.
+        stamp_ns: its stamp; None if the message is damaged.
+    """
 
     topic: str
     recorded_ns: int
+    stamp_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class StampedCamera:
+    """The camera that a camera info states, with the stamp of the camera info."""
+
     stamp_ns: int
+    calibration: CameraCalibration
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,115 +60,213 @@ class BagIndex:
         path: the bag.
         topics: which topics were read.
         entries: colour and depth messages in the order of the bag.
-        cameras: each different camera, with the stamp of its first camera info.
+        cameras: of each camera info that differs from the one before, in order of their stamps.
         ground_truth: the true poses; None where the bag has none.
     """
 
     path: Path
     topics: ChosenTopics
-    entries: list[ImageEntry]
-    cameras: Mapping[CameraCalibration, int]
+    entries: Sequence[ImageEntry]
+    cameras: Sequence[StampedCamera]
     ground_truth: Trajectory | None
 
     def recorded_ns(self, topic: str) -> NDArray[np.int64]:
         """[N] times of recording of the messages of an image topic."""
         return np.array([entry.recorded_ns for entry in self.entries if entry.topic == topic], np.int64)
 
-    def calibration(self) -> CameraCalibration:
-        """Returns the camera of the bag.
+    def check_cameras(self) -> None:
+        """Check that one camera took the images; its focus may change.
 
         Raises:
             DatasetError: there are several.
         """
-        if len(self.cameras) > 1:
-            (first, _), (second, stamp_ns) = list(self.cameras.items())[:2]
-            raise DatasetError(
-                f'{self.path}: the camera changes at {stamp_text(stamp_ns)} s from {first} to {second}; all frames must '
-                'come from one: cut the bag there, or state one camera in a camera.yaml beside it'
-            )
-        return next(iter(self.cameras))
+        first = self.cameras[0].calibration
+        for camera in self.cameras:
+            if not first.is_close_to(camera.calibration):
+                raise DatasetError(
+                    f'{self.path}: the camera changes at {stamp_text(camera.stamp_ns)} s from {first} to {camera.calibration}; '
+                    'all frames must come from one: cut the bag there, or state one camera in a camera.yaml beside it'
+                )
 
-    def pairs(self) -> list[RgbdSet]:
+    def pairs(self, max_interval_ns: int | None = None) -> list[RgbdSet]:
         """Pair colour and depth messages; ``color`` and ``depth`` of a pair are their numbers within their topic.
+
+        Args:
+            max_interval_ns: largest distance of the stamps; None adapts to the rate.
 
         Raises:
             DatasetError: nothing pairs up, or time does not increase.
         """
-        pairing = RgbdSynchronizer(mode='approximate', max_interval_ns=MAX_INTERVAL_NS, queue_size=QUEUE_SIZE, jump_ns=JUMP_NS)
-        pairing.add_info(self.entries[0].stamp_ns if self.entries else 0, None)  # one camera, known beforehand
+        pairing = RgbdSynchronizer('approximate', max_interval_ns, QUEUE_SIZE, JUMP_NS)
+        pairing.add_info(0, None)  # the cameras are known
         rgb, depth = self.topics.rgb, self.topics.depth
         counts = {rgb: 0, depth: 0}
         add = {rgb: pairing.add_color, depth: pairing.add_depth}
         pairs: list[RgbdSet] = []
         for entry in self.entries:
-            pairs += add[entry.topic](entry.stamp_ns, counts[entry.topic])
+            if entry.stamp_ns is not None:
+                pairs += add[entry.topic](entry.stamp_ns, counts[entry.topic])
             counts[entry.topic] += 1
         pairs += pairing.flush()
         if not pairs:
             raise DatasetError(
                 f'{self.path}: none of {counts[rgb]} images on {rgb} and {counts[depth]} on {depth} '
-                f'are within {MAX_INTERVAL_NS / 1e6:g} ms of each other by their header stamps'
+                f'are within {pairing.max_interval_ns / 1e6:g} ms of each other by their header stamps{self._nearest()}'
             )
-        if len(pairs) < counts[rgb]:
-            _log.warning('%s: %d of %d colour images have no depth', self.path, counts[rgb] - len(pairs), counts[rgb])
+        repeated = counts[rgb] - len({entry.stamp_ns for entry in self.entries if entry.topic == rgb})
+        if repeated:
+            _log.warning('%s: %d of %d colour images have a stamp that another one has, too', self.path, repeated, counts[rgb])
+        if (alone := counts[rgb] - repeated - len(pairs)) > 0:
+            _log.warning('%s: %d of %d colour images have no depth', self.path, alone, counts[rgb])
         check_increasing(np.array([pair.stamp_ns for pair in pairs], np.int64), str(self.path))
         return pairs
 
+    def _nearest(self) -> str:
+        """Returns how far depth is from colour, for the error message; empty where one of them is missing."""
+        color, depth = (
+            np.sort(np.array([entry.stamp_ns for entry in self.entries if entry.topic == topic and entry.stamp_ns is not None]))
+            for topic in (self.topics.rgb, self.topics.depth)
+        )
+        if not (color.size and depth.size):
+            return ''
+        after = np.searchsorted(depth, color).clip(0, len(depth) - 1)
+        before = (after - 1).clip(0)
+        to_after, to_before = depth[after] - color, depth[before] - color
+        gap_s = float(np.median(np.where(np.abs(to_after) < np.abs(to_before), to_after, to_before))) / 1e9
+        needed_s = np.ceil(abs(gap_s) * 1e3 + 1) / 1e3
+        way_out = f'--max-interval {needed_s:g} pairs them' if needed_s <= MAX_INTERVAL_S else 'are their clocks the same?'
+        return f'; the nearest depth is {gap_s:+.3f} s from its colour (median): {way_out}'
 
-def read_index(recording: Recording, topics: ChosenTopics) -> BagIndex:
-    """Read a bag once.
+
+@dataclass(slots=True)
+class _Pass:
+    """What is collected while a bag is read."""
+
+    entries: list[ImageEntry] = field(default_factory=list)
+    cameras: list[StampedCamera] = field(default_factory=list)
+    poses_by_stamp: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    num_poses: int = 0
+    cameras_by_p: list[StampedCamera] = field(default_factory=list)
+    remark: str = ''
+    refused: list[str] = field(default_factory=list)
+    damaged: dict[str, list[str]] = field(default_factory=dict)
+
+
+def read_index(recording: Recording, topics: ChosenTopics, *, use_receive_time: bool = False) -> BagIndex:
+    """Read a bag once. Messages that cannot be used are left out with a warning.
+
+    Args:
+        recording: the bag.
+        topics: which of its topics to read.
+        use_receive_time: True to take times of recording for stamps.
 
     Raises:
-        DatasetError: messages are missing or unreadable.
-        CameraError: a camera info cannot be used.
+        DatasetError: the bag is damaged, or nobody stamped the images.
+        CameraError: no camera info can be used.
     """
-    counts = dict.fromkeys(topics.names, 0)
-    entries: list[ImageEntry] = []
-    cameras: dict[CameraCalibration, int] = {}
-    poses_by_stamp: dict[int, NDArray[np.float64]] = {}
-    for message in recording.messages(topics.names):
-        counts[message.topic] += 1
-        stamp_ns = _stamp_ns(recording, message)
-        if message.topic == topics.info:
-            cameras.setdefault(_calibration(recording, message), stamp_ns)
-        elif message.topic == topics.ground_truth:
-            poses_by_stamp[stamp_ns] = _pose(recording, message)
-        else:
-            entries.append(ImageEntry(message.topic, message.time_ns, stamp_ns))
-    _check_complete(recording, counts)
-    return BagIndex(recording.path, topics, entries, cameras, _trajectory(poses_by_stamp))
-
-
-def _check_complete(recording: Recording, counts: Mapping[str, int]) -> None:
-    for topic, count in counts.items():
-        stated = recording.topics[topic].num_messages
-        if count != stated:
-            raise DatasetError(
-                f'{recording.path}: {topic} has {count} messages of the {stated} that the bag states; is the copy complete?'
-            )
-
-
-def _stamp_ns(recording: Recording, message: RawMessage) -> int:
-    """Returns the header's stamp; every type read here begins with a header."""
     try:
-        return serialized_stamp_ns(message.data)
-    except MessageError as error:
-        raise DatasetError(f'{recording.path}: a message on {message.topic} {error}') from None
+        found = _read(recording, topics, use_receive_time)
+    except DatasetError:
+        if not recording.salvage():
+            raise
+        found = _read(recording, topics, use_receive_time)
+    _choose_cameras(found)
+    _warn(recording, topics, found)
+    if topics.info is not None and not found.cameras:
+        reason = found.refused[0] if found.refused else 'there is no message on it'
+        raise CameraError(f'{recording.path}: {topics.info}: {reason}')
+    for topic in (topics.rgb, topics.depth):
+        _check_stamps(recording, topic, [entry.stamp_ns for entry in found.entries if entry.topic == topic])
+    cameras = _changes(sorted(found.cameras, key=lambda camera: camera.stamp_ns))
+    return BagIndex(recording.path, topics, found.entries, cameras, _trajectory(found.poses_by_stamp))
 
 
-def _calibration(recording: Recording, message: RawMessage) -> CameraCalibration:
+def _read(recording: Recording, topics: ChosenTopics, use_receive_time: bool) -> _Pass:
+    found = _Pass()
+    for message in recording.messages(topics.names):
+        stamp_ns: int | None = None
+        try:
+            stamp_ns = message.time_ns if use_receive_time and message.data else serialized_stamp_ns(message.data)
+        except MessageError as error:
+            found.damaged.setdefault(message.topic, []).append(str(error))
+        if message.topic in (topics.rgb, topics.depth):
+            found.entries.append(ImageEntry(message.topic, message.time_ns, stamp_ns))
+        elif stamp_ns is not None and message.topic == topics.info:
+            _add_camera(found, recording, message, stamp_ns)
+        elif stamp_ns is not None:
+            _add_pose(found, recording, message, stamp_ns)
+    return found
+
+
+def _add_camera(found: _Pass, recording: Recording, message: RawMessage, stamp_ns: int) -> None:
     try:
         info = recording.decode(message.topic, message.data)
-        return CameraCalibration.from_intrinsics(camera_info.parameters(info))
-    except (MessageError, CameraError) as error:
-        raise CameraError(f'{recording.path}: {message.topic}: {error}') from None
+        calibration = CameraCalibration.from_intrinsics(camera_info.parameters(info))
+        remark = remarks.on_info(info)
+    except (MessageError, CameraError, DatasetError) as error:
+        found.refused.append(str(error))
+        return
+    found.remark = found.remark or remark
+    cameras = found.cameras_by_p if remark else found.cameras
+    if not cameras or cameras[-1].calibration != calibration or cameras[-1].stamp_ns > stamp_ns:
+        cameras.append(StampedCamera(stamp_ns, calibration))
 
 
-def _pose(recording: Recording, message: RawMessage) -> NDArray[np.float64]:
-    try:
-        return poses.pose_matrix(recording.decode(message.topic, message.data).pose)
-    except MessageError as error:
-        raise DatasetError(f'{recording.path}: {message.topic}: {error}') from None
+def _choose_cameras(found: _Pass) -> None:
+    """Use camera infos that have only P where no other has K."""
+    if found.cameras_by_p and found.cameras:
+        found.refused.append('CameraInfo K is all zero')
+        found.remark = ''
+    elif found.cameras_by_p:
+        found.cameras = found.cameras_by_p
+
+
+def _add_pose(found: _Pass, recording: Recording, message: RawMessage, stamp_ns: int) -> None:
+    found.num_poses += 1
+    with suppress(MessageError, DatasetError):  # an unknown pose, or a damaged message
+        found.poses_by_stamp[stamp_ns] = poses.pose_matrix(recording.decode(message.topic, message.data).pose)
+
+
+def _warn(recording: Recording, topics: ChosenTopics, found: _Pass) -> None:
+    for topic, reasons in found.damaged.items():
+        _log.warning('%s: %d messages on %s are left out: the first %s', recording.path, len(reasons), topic, reasons[0])
+    if found.refused and found.cameras:
+        _log.warning('%s: messages on %s that state no camera are left out: %s', recording.path, topics.info, found.refused[0])
+    if found.remark:
+        _log.warning('%s: %s', recording.path, found.remark)
+    unknown = found.num_poses - len(found.poses_by_stamp)
+    if unknown:
+        _log.warning(
+            '%s: %d of %d poses on %s are unknown (not finite, or stamped twice) and left out',
+            recording.path, unknown, found.num_poses, topics.ground_truth,
+        )  # fmt: skip
+    counts = dict.fromkeys(topics.names, 0)
+    for entry in found.entries:
+        counts[entry.topic] += 1
+    for topic in (topics.rgb, topics.depth):
+        stated = recording.topics[topic].num_messages
+        if counts[topic] < stated:
+            _log.warning(
+                '%s: %s has %d messages of the %d that the bag states; is the copy complete?',
+                recording.path, topic, counts[topic], stated,
+            )  # fmt: skip
+
+
+def _check_stamps(recording: Recording, topic: str, stamps_ns: Sequence[int | None]) -> None:
+    """Refuse images that nobody stamped."""
+    known = [stamp for stamp in stamps_ns if stamp is not None]
+    if len(known) >= MIN_STAMPS and len(set(known)) == 1:
+        raise DatasetError(
+            f'{recording.path}: all {len(known)} stamps on {topic} are equal ({stamp_text(known[0])} s): the driver does not '
+            'stamp; --use-receive-time takes the times of recording instead'
+        )
+
+
+def _changes(cameras: Sequence[StampedCamera]) -> list[StampedCamera]:
+    return [
+        camera for before, camera in zip([None, *cameras], cameras, strict=False)
+        if before is None or before.calibration != camera.calibration
+    ]  # fmt: skip
 
 
 def _trajectory(poses_by_stamp: Mapping[int, NDArray[np.float64]]) -> Trajectory | None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from rosbags.interfaces import Qos, QosTime
+from rosbags.rosbag2.metadata import parse_qos
 
 INFINITE_NS = (2**31 - 1) * 1_000_000_000
 """Durations from this one on mean 'infinite': recorders write it, or a longer one."""
@@ -35,6 +37,14 @@ class OfferedQos:
     lifespan_ns: int | None
     liveliness_lease_duration_ns: int | None
     avoid_ros_namespace_conventions: bool
+
+
+def recorded_qos(profiles: Any) -> list[Qos]:
+    """Returns the profiles of a topic as recorded, a text or a list; none if they are damaged, because messages do without."""
+    try:
+        return parse_qos(profiles or '')
+    except Exception:  # noqa: BLE001 - the library checks little
+        return []
 
 
 def offered_qos(qos: Qos) -> OfferedQos:

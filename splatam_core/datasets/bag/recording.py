@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import logging
 import weakref
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from rosbags.interfaces import Connection
 
+from splatam_core.datasets.bag import realsense
 from splatam_core.datasets.bag.qos import OfferedQos
+from splatam_core.datasets.bag.ros1 import ROS1_SUFFIX
 from splatam_core.datasets.bag.storage import Storage, open_storage, read_errors
-from splatam_core.datasets.bag.typestore import IMAGE, IMAGES, deserialize
+from splatam_core.datasets.bag.typestore import FLOAT32, IMAGE, IMAGES, deserialize
 from splatam_core.errors import DatasetError
 
 DEPTH_ENCODINGS = ('16uc1', 'mono16', '32fc1')
+NUM_TRIED = 10  # messages at the beginning of a topic of which one must be readable
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,12 +61,25 @@ class RawMessage:
     Attributes:
         topic: name of its topic, as recorded.
         time_ns: time of recording.
-        data: its CDR bytes.
+        data: its CDR bytes; empty if it is damaged.
     """
 
     topic: str
     time_ns: int
     data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class ImageFacts:
+    """What the first image on a topic states.
+
+    Attributes:
+        encoding: of its pixels; of a compressed image, its format.
+        frame_id: its coordinate frame.
+    """
+
+    encoding: str
+    frame_id: str
 
 
 class Recording:
@@ -76,21 +96,41 @@ class Recording:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open a bag.
+        """Open a bag. Warns if messages are missing.
 
         Raises:
             DatasetError: there is no such bag, it cannot be read, or it holds no message.
         """
         self.path = path
+        self._is_damaged = False
         self._idle: list[Storage] = []
-        self._encodings: dict[str, str | None] = {}
+        self._facts: dict[str, ImageFacts | None] = {}
         self._closed_once = weakref.finalize(self, _close_all, self._idle)
-        with read_errors(path), self._storage() as storage:
-            self.start_ns, self.end_ns = storage.start_ns, storage.end_ns
-            self.topics = _topics(storage)
+        self._read_topics()
         if not any(topic.num_messages for topic in self.topics.values()):
             self.close()
             raise DatasetError(f'{path}: the bag is empty: there is no message on any topic; was anything recorded?')
+
+    def _read_topics(self) -> None:
+        with read_errors(self.path), self._storage() as storage:
+            self.start_ns, self.end_ns = storage.start_ns, storage.end_ns
+            self.topics = _topics(storage)
+            for note in storage.notes:
+                _log.warning('%s: %s', self.path, note)
+
+    def salvage(self) -> bool:
+        """Search the files for messages that are whole, after an iteration failed. Returns False if that cannot help.
+
+        Raises:
+            DatasetError: there are none.
+        """
+        if self._is_damaged or self.path.suffix == ROS1_SUFFIX:
+            return False
+        self._is_damaged = True
+        _close_all(self._idle)
+        self._facts.clear()
+        self._read_topics()
+        return True
 
     @property
     def duration_s(self) -> float:
@@ -102,7 +142,7 @@ class Recording:
         return sorted(name for name, topic in self.topics.items() if topic.num_messages and topic.type_name in type_names)
 
     def messages(self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None) -> Iterator[RawMessage]:
-        """Iterate over messages in the order of their recording.
+        """Iterate over messages in the order of their recording. A damaged message has no bytes.
 
         Args:
             topics: names of the topics to read.
@@ -119,6 +159,22 @@ class Recording:
             for connection, time_ns, data in storage.messages(connections, start_ns, stop_ns):
                 yield RawMessage(connection.topic, time_ns, data)
 
+    def last_before(self, topics: Collection[str], time_ns: int) -> list[RawMessage]:
+        """Returns the last message of each topic that was recorded before a time.
+
+        It searches backwards, because most topics have a message shortly before.
+
+        Raises:
+            DatasetError: the files are damaged.
+        """
+        found: dict[str, RawMessage] = {}
+        stop_ns, span_ns = time_ns, 10**9
+        while (missing := set(topics) - found.keys()) and stop_ns > self.start_ns:
+            start_ns = max(stop_ns - span_ns, self.start_ns)
+            found |= {message.topic: message for message in self.messages(missing, start_ns, stop_ns)}
+            stop_ns, span_ns = start_ns, 8 * span_ns
+        return list(found.values())
+
     def decode(self, topic: str, data: bytes) -> Any:
         """Deserialize a message of a topic.
 
@@ -129,13 +185,33 @@ class Recording:
             return deserialize(self.topics[topic].type_name, data)
 
     def encoding(self, topic: str) -> str | None:
-        """Returns the encoding of the first image on a topic (of a compressed image, its format); None without messages."""
-        if topic not in self._encodings:
-            first = next(self.messages([topic]), None)
-            message = None if first is None else self.decode(topic, first.data)
-            is_raw = self.topics[topic].type_name == IMAGE
-            self._encodings[topic] = None if message is None else message.encoding if is_raw else message.format
-        return self._encodings[topic]
+        """Returns the encoding of the first image on a topic (of a compressed image, its format); None without images."""
+        facts = self.image_facts(topic)
+        return None if facts is None else facts.encoding
+
+    def image_facts(self, topic: str) -> ImageFacts | None:
+        """Returns what the first image on a topic states; None if none of the first ten messages is one."""
+        if topic not in self._facts:
+            found = (self._read_facts(message) for message in islice(self.messages([topic]), NUM_TRIED))
+            self._facts[topic] = next((facts for facts in found if facts is not None), None)
+        return self._facts[topic]
+
+    def _read_facts(self, message: RawMessage) -> ImageFacts | None:
+        try:
+            image = self.decode(message.topic, message.data)
+        except DatasetError:
+            return None
+        is_raw = self.topics[message.topic].type_name == IMAGE
+        return ImageFacts(image.encoding if is_raw else image.format, image.header.frame_id)
+
+    def depth_unit_m(self, topic: str) -> float | None:
+        """Returns the metres per count of a depth topic that the bag states, as RealSense Viewer does; None if it states none."""
+        unit_topic = realsense.unit_topic(topic)
+        if unit_topic in self.topics_of(FLOAT32):
+            for message in islice(self.messages([unit_topic]), 1):
+                return realsense.unit_m(message.data[4:8])
+        with read_errors(self.path), self._storage() as storage:
+            return realsense.unit_m(storage.trailing(topic))
 
     def is_depth(self, topic: str) -> bool:
         """Returns True if an image topic carries depth, judged by its first message and, if compressed, by its name."""
@@ -159,7 +235,7 @@ class Recording:
     @contextmanager
     def _storage(self) -> Iterator[Storage]:
         """Lend an open storage that nobody else reads from."""
-        storage = self._idle.pop() if self._idle else open_storage(self.path)
+        storage = self._idle.pop() if self._idle else open_storage(self.path, is_damaged=self._is_damaged)
         try:
             yield storage
         finally:

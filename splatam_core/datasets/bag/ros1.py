@@ -27,7 +27,8 @@ class Rosbag1:
         self.connections: Sequence[Connection] = self._reader.connections
         self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time - 1
         self._ros2 = get_typestore(Stores.ROS2_JAZZY)
-        self._to_cdr: dict[int, Callable[[bytes], memoryview]] = {}
+        self.notes: list[str] = []
+        self._converters: dict[int, _Converter] = {}
 
     def type_name(self, connection: Connection) -> str:
         """See ``Storage``."""
@@ -38,30 +39,42 @@ class Rosbag1:
         assert isinstance(connection.ext, ConnectionExtRosbag1)
         return tuple(map(offered_qos, LATCH)) if connection.ext.latching else ()
 
+    def trailing(self, topic: str) -> bytes:
+        """See ``Storage``; RealSense Viewer puts the unit of depth there."""
+        connections = [connection for connection in self.connections if connection.topic == topic]
+        first = next(iter(self._reader.messages(connections)), None) if connections else None
+        return b'' if first is None else self._converter(first[0]).trailing(first[2])
+
     def messages(
         self, connections: Sequence[Connection], start_ns: int | None, stop_ns: int | None
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """See ``Storage``."""
         for connection, time_ns, data in self._reader.messages(connections, start_ns, stop_ns):
-            if connection.id not in self._to_cdr:
-                self._to_cdr[connection.id] = self._converter(connection)
-            yield connection, time_ns, bytes(self._to_cdr[connection.id](data))
+            yield connection, time_ns, self._converter(connection).to_cdr(data)
 
     def close(self) -> None:
         """See ``Storage``."""
         if self._reader.bio is not None:
             self._reader.close()
 
-    def _converter(self, connection: Connection) -> Callable[[bytes], memoryview]:
-        """Returns a function that converts messages of a connection to CDR, by the type's definition in the bag."""
+    def _converter(self, connection: Connection) -> _Converter:
+        if connection.id not in self._converters:
+            self._converters[connection.id] = self._make_converter(connection)
+        return self._converters[connection.id]
+
+    def _make_converter(self, connection: Connection) -> _Converter:
+        """Returns the converter of a connection's messages, by the type's definition in the bag."""
         ros1 = get_typestore(Stores.EMPTY)
         ros1.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
         source, target = connection.msgtype, self.type_name(connection)
         if target not in self._ros2.fielddefs:
             self._adopt(ros1, source, target)
+        convert: Callable[[bytes], memoryview]
         if is_same_wireformat(ros1, self._ros2, source, target):
-            return partial(self._ros2.ros1_to_cdr, typename=target)
-        return partial(migrate_bytes, ros1, self._ros2, source, target, {}, src_is2=False, dst_is2=True)
+            convert = partial(self._ros2.ros1_to_cdr, typename=target)
+        else:
+            convert = partial(migrate_bytes, ros1, self._ros2, source, target, {}, src_is2=False, dst_is2=True)
+        return _Converter(convert, partial(_length, ros1, source))
 
     def _adopt(self, ros1: Typestore, name: str, target: str) -> None:
         """Register the bag's definition of a type that ROS 2 does not define, with ROS 2's header."""
@@ -69,3 +82,43 @@ class Rosbag1:
         types = get_types_from_msg(definition, target)
         types.pop(HEADER, None)
         self._ros2.register(types)
+
+
+class _Converter:
+    """Converts the messages of a connection to CDR. Bytes behind the end of a message are cut off."""
+
+    def __init__(self, convert: Callable[[bytes], memoryview], length: Callable[[bytes], int]) -> None:
+        self._convert = convert
+        self._length = length
+        self._num_trailing = 0
+
+    def to_cdr(self, data: bytes) -> bytes:
+        """Returns the CDR bytes of a message; empty if it is damaged."""
+        for attempt in (self._cut_as_before, self._cut_by_content):
+            try:
+                return bytes(self._convert(attempt(data)))
+            except Exception:  # noqa: BLE001 - whatever damaged bytes make the library raise
+                continue
+        return b''
+
+    def trailing(self, data: bytes) -> bytes:
+        """Returns the bytes behind the end of a message; empty if it is damaged."""
+        try:
+            return bytes(data[self._length(data) :])
+        except Exception:  # noqa: BLE001 - whatever damaged bytes make the library raise
+            return b''
+
+    def _cut_as_before(self, data: bytes) -> bytes:
+        return data[: len(data) - self._num_trailing]
+
+    def _cut_by_content(self, data: bytes) -> bytes:
+        length = self._length(data)
+        self._num_trailing = len(data) - length
+        return data[:length]
+
+
+def _length(store: Typestore, type_name: str, data: bytes) -> int:
+    """Returns how many bytes a message of ROS 1 has."""
+    definition = store.get_msgdef(type_name)
+    _, end = definition.deserialize_ros1(data, 0, definition.cls, store)
+    return end

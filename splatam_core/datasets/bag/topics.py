@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from splatam_core.datasets.bag import realsense
 from splatam_core.datasets.bag.recording import Recording
 from splatam_core.datasets.bag.typestore import CAMERA_INFO, IMAGES, POSE_STAMPED
 from splatam_core.datasets.base import BagTopics
@@ -14,6 +15,7 @@ RGB_TOPIC, DEPTH_TOPIC, INFO_TOPIC = '/rgb/image', '/depth/image', '/rgb/camera_
 """The topics of bags that ``splatam convert`` writes; those of other bags are found by type."""
 
 GROUND_TRUTH_TOPIC = '/ground_truth/pose'
+GREY_ENCODINGS = ('mono8', '8uc1')
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +51,8 @@ def choose_topics(recording: Recording, wanted: BagTopics, *, need_info: bool) -
     Raises:
         DatasetError: a wanted topic does not fit, no topic does, or several do.
     """
-    is_depth = {topic: _is_depth(recording, topic) for topic in recording.topics_of(*IMAGES)}
-    colors = [topic for topic in is_depth if not is_depth[topic]]
+    is_depth = {topic: recording.is_depth(topic) for topic in recording.topics_of(*IMAGES) if recording.encoding(topic) is not None}
+    colors = _narrowed(recording, [topic for topic in is_depth if not is_depth[topic]])
     rgb = _choose(recording, 'colour image', '--rgb', wanted.rgb, fitting=colors, allowed=list(is_depth))
     others = [topic for topic in is_depth if topic != rgb]
     depths = [topic for topic in is_depth if is_depth[topic]]
@@ -58,16 +60,17 @@ def choose_topics(recording: Recording, wanted: BagTopics, *, need_info: bool) -
     info = None
     if need_info:
         infos = recording.topics_of(CAMERA_INFO)
-        beside = [topic for topic in infos if _namespace(topic) == _namespace(rgb)]
+        beside = [topic for topic in infos if namespace(topic) == namespace(rgb)]
         info = _choose(recording, 'camera info', '--info', wanted.info, fitting=beside or infos, allowed=infos)
     has_ground_truth = GROUND_TRUTH_TOPIC in recording.topics_of(POSE_STAMPED)
     return ChosenTopics(rgb, depth, info, GROUND_TRUTH_TOPIC if has_ground_truth else None)
 
 
-def _is_depth(recording: Recording, topic: str) -> bool:
-    if recording.encoding(topic) is None:
-        raise DatasetError(f'{recording.path}: {topic} has no messages, though the bag states some; is it complete?')
-    return recording.is_depth(topic)
+def _narrowed(recording: Recording, colors: list[str]) -> list[str]:
+    """Returns the topics that are likely colour images: not the infrared ones beside them."""
+    named = [topic for topic in colors if realsense.is_color(topic)]
+    colored = [topic for topic in colors if (recording.encoding(topic) or '').lower() not in GREY_ENCODINGS]
+    return named or colored or colors
 
 
 def _choose(recording: Recording, what: str, option: str, wanted: str | None, *, fitting: list[str], allowed: list[str]) -> str:
@@ -93,6 +96,9 @@ def _listed(names: Iterable[str]) -> str:
     return ', '.join(names) or 'none'
 
 
-def _namespace(topic: str) -> str:
-    """Where ROS convention puts the camera info of an image topic; a compressed image lies one level below its raw one."""
+def namespace(topic: str) -> str:
+    """Returns what an image topic and its camera info have in common; a compressed image lies one level below its raw one."""
+    for suffix in (realsense.IMAGE_DATA, realsense.CAMERA_INFO):
+        if topic.endswith(suffix):
+            return topic.removesuffix(suffix)
     return topic.removesuffix('/compressed').removesuffix('/compressedDepth').rpartition('/')[0]

@@ -11,6 +11,7 @@ from rosbags.typesys.store import Typestore
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+FLOAT32 = 'std_msgs/msg/Float32'
 POSE_STAMPED = 'geometry_msgs/msg/PoseStamped'
 IMAGES = (IMAGE, COMPRESSED_IMAGE)
 
