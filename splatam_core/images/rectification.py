@@ -44,11 +44,8 @@ class FrameFactory:
         if self.width is not None and not MIN_SIDE <= self.width <= MAX_SIDE:
             raise CameraError(f'width {self.width}: frames must be at least {MIN_SIDE} and at most {MAX_SIDE} pixels wide')
         camera = self.camera
-        if min(camera.width, camera.height) < MIN_SIDE or camera.width * camera.height > MAX_PIXELS:
-            raise CameraError(
-                f'frames would be {camera.width}x{camera.height} pixels: both must be at least {MIN_SIDE}, and a frame at most '
-                f'{MAX_PIXELS} pixels; choose another width'
-            )
+        if camera.width * camera.height > MAX_PIXELS:
+            raise CameraError(f'frames would be {camera.width}x{camera.height}: at most {MAX_PIXELS} pixels; choose another width')
 
     @cached_property
     def camera(self) -> PinholeCamera:
