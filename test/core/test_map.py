@@ -228,7 +228,7 @@ def test_views_are_made_smaller_by_scale_and_width(scale: float, max_width: int,
 def test_finishing_ends_when_its_time_is_up_and_nothing_is_asked_of_it_by_default() -> None:
     keyframe, rng = PosedView(_view(), EYE), np.random.default_rng(0)
     in_time = _Listed()
-    assert _finish([keyframe], in_time, _finishing(100_000_000), rng, TimeLimit(0.2)) < 100_000_000
+    assert _finish([keyframe], in_time, _finishing(100_000), rng, TimeLimit(0.02)) < 100_000
     first, last = in_time.asked[0][0].rgb, in_time.asked[-1][0].rgb
     assert last < 0.1 * first  # it faded, from 5 to about 0.2 of the usual: a step takes a small part of the time
     assert _finish([keyframe], _Listed(), _finishing(5), rng, TimeLimit(0.0)) == 0
