@@ -37,6 +37,13 @@ QOS = Qos(QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLAT
           QosLiveliness.SYSTEM_DEFAULT, NO_TIME, False)  # fmt: skip
 
 
+BOMB = (
+    'a0: &a0 [x]\n'
+    + ''.join(f'a{i}: &a{i} [{", ".join([f"*a{i - 1}"] * 9)}]\n' for i in range(1, 12))
+    + 'rosbag2_bagfile_information: {relative_file_paths: *a11}'
+)
+
+
 def color(stamp_ns, number=0, encoding='rgb8'):
     message = images.color_message(FACTORY, np.roll(RGB, number, axis=1), stamp_ns, 'color')
     message.encoding = encoding
@@ -415,12 +422,21 @@ def test_a_missing_or_renamed_split_is_told_and_the_rest_read(tmp_path, whole, c
         open_sequence(str(bag))
 
 
-@pytest.mark.parametrize('text', ['', '{}', 'rosbag2_bagfile_information: 3', ': :\n -', '[' * 3000])
+@pytest.mark.parametrize('text', ['', '{}', 'rosbag2_bagfile_information: 3', ': :\n -', '[' * 3000, BOMB])
 def test_damaged_metadata_beside_whole_files(tmp_path, whole, text, caplog):
     bag = write(tmp_path / 'bag', scene())
     (bag / 'metadata.yaml').write_text(text)
     assert colors_of(open_sequence(str(bag))) == whole
     assert 'metadata.yaml is damaged' in caplog.text
+
+
+def test_names_and_profiles_that_unfold_to_gigabytes_are_not_read(tmp_path, whole):
+    bag = write(tmp_path / 'bag', scene())
+    content = yaml.safe_load((bag / 'metadata.yaml').read_text())
+    for topic in content['rosbag2_bagfile_information']['topics_with_message_count']:
+        topic['topic_metadata']['offered_qos_profiles'] = BOMB
+    (bag / 'metadata.yaml').write_text(yaml.safe_dump(content))
+    assert colors_of(open_sequence(str(bag))) == whole
 
 
 def test_a_file_that_is_no_bag_beside_others_is_left_out(tmp_path, whole, caplog):

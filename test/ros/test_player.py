@@ -318,7 +318,7 @@ def assert_complaints(players: Sequence[Process], expected: Sequence[str]) -> No
 
 
 def truncate(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    path.write_bytes(path.read_bytes()[:5000])  # no message is whole
 
 
 def damaged_database(bag: Path, path: Path) -> None:

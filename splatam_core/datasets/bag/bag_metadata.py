@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 
-import yaml
-
 from splatam_core.datasets.bag.qos import OfferedQos, offered_qos, recorded_qos
+from splatam_core.errors import DatasetError
+from splatam_core.text_files import parse_yaml, read_text
 
 NAME = 'metadata.yaml'
+MAX_BYTES = 2**24  # hundreds of splits and topics take a megabyte
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,10 +37,10 @@ def read_metadata(folder: Path) -> BagMetadata:
     if not path.exists():
         return BagMetadata(problem=f'there is no {NAME}, the recording was not closed')
     try:
-        content = yaml.safe_load(path.read_text())['rosbag2_bagfile_information']
-        names = tuple(PurePath(str(name)).name for name in content['relative_file_paths'])
+        content = parse_yaml(read_text(path, DatasetError, MAX_BYTES))['rosbag2_bagfile_information']
+        names = tuple(PurePath(name).name for name in content['relative_file_paths'])
         topics = [topic for topic in content.get('topics_with_message_count') or [] if isinstance(topic, dict)]
-    except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError, AttributeError, RecursionError) as error:
+    except (DatasetError, ValueError, TypeError, KeyError, AttributeError) as error:
         return BagMetadata(problem=f'{NAME} is damaged ({type(error).__name__})')
     num_messages: dict[str, int] = {}
     offered: dict[str, tuple[OfferedQos, ...]] = {}

@@ -8,6 +8,8 @@ from typing import Any
 from rosbags.interfaces import Qos, QosTime
 from rosbags.rosbag2.metadata import parse_qos
 
+from splatam_core.text_files import parse_yaml
+
 INFINITE_NS = (2**31 - 1) * 1_000_000_000
 """Durations from this one on mean 'infinite': recorders write it, or a longer one."""
 
@@ -42,7 +44,7 @@ class OfferedQos:
 def recorded_qos(profiles: Any) -> list[Qos]:
     """Returns the profiles of a topic as recorded, a text or a list; none if they are damaged, because messages do without."""
     try:
-        return parse_qos(profiles or '')
+        return parse_qos(parse_yaml(profiles) if isinstance(profiles, str) else profiles or [])
     except Exception:  # noqa: BLE001 - the library checks little
         return []
 
