@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 
-from splatam_core.errors import ConfigError
+from splatam_core.errors import ConfigError, one_line
 from splatam_core.resources import config_dir
 from splatam_core.retired_settings import migrated, tombstone
 from splatam_core.settings import Setting, Value, flatten, leaf, setting, settings_of, unflatten, with_leaf
@@ -458,11 +458,11 @@ def _read_preset(preset: str) -> dict[str, Any]:
 def _parse_override(text: str) -> tuple[str, object]:
     name, equals, value = text.partition('=')
     if not equals:
-        raise ConfigError(f"'{text}': expected key=value, for example tracking.iterations=40")
+        raise ConfigError(f"'{one_line(text)}': expected key=value, for example tracking.iterations=40")
     try:
         return name.strip(), _number(parse_yaml(value))
     except ValueError:
-        raise ConfigError(f"'{text}': the value is not valid YAML") from None
+        raise ConfigError(f"'{one_line(text)}': the value is not valid YAML") from None
 
 
 def _number(value: object) -> object:

@@ -133,8 +133,6 @@ def _begin(args: argparse.Namespace) -> _Job:
     sequence, slam = prepare(open_source(source), config)
     truth = _checked_ground_truth(sequence, args)
     _say_backend(slam)
-    if not args.no_evaluate:
-        _check_truth(sequence)
     every, keep = args.checkpoint_every, args.keep_checkpoints or KEEP_CHECKPOINTS
     description = RunDescription('splatam run', args.preset, source, every, keep)
     folder = RunFolder.create(args.out, config, description, overwrite=args.overwrite)
@@ -166,14 +164,6 @@ def _resume(args: argparse.Namespace) -> _Job:
 def _checked_ground_truth(sequence: FrameSequence, args: argparse.Namespace) -> Trajectory | None:
     """Returns the true poses, read before the run begins, so that a fault in them is said before it and costs no time."""
     return None if args.no_evaluate else usable_ground_truth(sequence)
-
-
-def _check_truth(sequence: FrameSequence) -> None:
-    """Says before the run what is wrong with the ground truth; it costs the trajectory error, and nothing else."""
-    try:
-        sequence.ground_truth()
-    except SplatamError as error:
-        say(f'there will be no trajectory error: {error}')
 
 
 def _say_backend(slam: Slam) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import random
 from array import array
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
@@ -17,7 +18,7 @@ from splatam_core.runs.frame_records import STAGES, FrameRecord
 from splatam_core.types import Status
 
 MAX_TIMINGS = 1 << 17
-"""Largest number of frames whose timings are kept, for their percentiles: 5 MiB. Longer runs keep every second, fourth, ..."""
+"""Largest number of frames whose timings are kept, for their percentiles: 5 MiB. Longer runs keep a random sample."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,18 +232,18 @@ class FrameStatistics:
         self.frames = self.lost = 0
         self._process_ms = self._decode_ms = 0.0
         self._num_decoded = 0
-        self._every = 1  # of so many frames, the timings of one are kept
-        self._timings = array('d')
+        self._timings = array('d')  # of all frames, or of so many drawn at random
+        self._random = random.Random(0)
         for record in records:
             self.add(record)
 
     def add(self, record: FrameRecord) -> None:
         """Adds the next frame."""
-        if self.frames % self._every == 0:
-            self._timings.extend(getattr(record.timings, stage) for stage in STAGES)
-            if len(self._timings) >= MAX_TIMINGS * len(STAGES):
-                self._every *= 2
-                self._timings = array('d', self._table()[::2].tobytes())
+        timings = array('d', (getattr(record.timings, stage) for stage in STAGES))
+        if self.frames < MAX_TIMINGS:
+            self._timings.extend(timings)
+        elif (place := self._random.randrange(self.frames + 1)) < MAX_TIMINGS:  # Vitter 1985, algorithm R
+            self._timings[place * len(STAGES) : (place + 1) * len(STAGES)] = timings
         self.frames += 1
         self.lost += record.status is Status.LOST
         self._process_ms += record.process_ms

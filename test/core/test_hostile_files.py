@@ -327,7 +327,7 @@ def test_maps_of_any_values_and_headers(values: np.ndarray, header: list[str], a
     attempt(use, MapFileError)
 
 
-@FUZZ
+@settings(FUZZ, max_examples=max(1, EXAMPLES // 4))  # YAML takes a second a file
 @given(data=st.data())
 def test_configurations(data: st.DataObject, tmp_path: Path) -> None:
     path = tmp_path / 'config.yaml'

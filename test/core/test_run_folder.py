@@ -400,12 +400,10 @@ def frame_of_a_pixel(index: int) -> RgbdFrame:
 
 
 @pytest.mark.slow
-def test_a_million_frames_take_no_more_memory_than_a_hundred_thousand(tmp_path: Path) -> None:
+def test_a_million_frames_take_no_more_memory_than_half_of_them(tmp_path: Path) -> None:
     """Nine hours at 30 Hz; a list of records would take 500 MB."""
     folder, some = RunFolder.create(tmp_path, CONFIG, NODE), frame_of_a_pixel(0)
     pose = np.eye(4)
-    used = {}
-    tracemalloc.start()
     for index in range(1_000_001):
         status = Status.TRACKED if index % 100 == 0 else Status.LOST
         timings = StageTimings(total=float(index % 1000))
@@ -414,15 +412,16 @@ def test_a_million_frames_take_no_more_memory_than_a_hundred_thousand(tmp_path: 
             '', timings,
         )  # fmt: skip
         folder.append(some, frame_result, 0.01)
-        if index in (300_000, 1_000_000):
-            used[index] = tracemalloc.get_traced_memory()[0]
+        if index == 500_000:
+            tracemalloc.start()
+    grown = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
     metrics = folder._statistics.metrics()
     folder.close()
-    assert used[1_000_000] - used[300_000] < 3 << 20
+    assert grown < 1 << 20
     assert (metrics.frames, metrics.lost, metrics.fps) == (1_000_001, 990_000, 100.0)
-    assert metrics.timings_ms['total'].median == pytest.approx(499.5, abs=1)
-    assert metrics.timings_ms['total'].p95 == pytest.approx(949, abs=2)
+    assert metrics.timings_ms['total'].median == pytest.approx(499.5, abs=5)
+    assert metrics.timings_ms['total'].p95 == pytest.approx(949, abs=5)
 
 
 @pytest.mark.parametrize('count', [1, MAX_TIMINGS - 1, MAX_TIMINGS, 3 * MAX_TIMINGS + 5])
@@ -432,7 +431,7 @@ def test_percentiles_are_exact_up_to_a_number_of_frames_and_close_beyond(count: 
     for value in total:
         statistics.add(FrameRecord(0, Status.TRACKED, False, 0, 0.0, 0.0, 1.0, None, StageTimings(total=float(value)), ''))
     stage = statistics.metrics().timings_ms['total']
-    exact = count < MAX_TIMINGS
+    exact = count <= MAX_TIMINGS
     assert stage.median == pytest.approx(np.percentile(total, 50), rel=1e-9 if exact else 0.02, abs=6e-4)
     assert stage.p95 == pytest.approx(np.percentile(total, 95), rel=1e-9 if exact else 0.02, abs=6e-4)
     assert statistics.metrics().frames == count
