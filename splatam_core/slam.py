@@ -11,6 +11,8 @@ from splatam_core.mapping.posed import PosedFrame
 from splatam_core.tracking.verdict import verify
 from splatam_core.types import FrameResult, RgbdFrame, Status
 
+MIN_SIDE = 16  # pixels
+
 
 class Slam(SlamLifecycle):
     """The algorithm on one page; ``SlamLifecycle`` holds the rest."""
@@ -52,6 +54,11 @@ class Slam(SlamLifecycle):
     def _initialize(self, current: CurrentFrame, seen: Observation) -> FrameResult:
         """Starts the map at the identity pose."""
         reason = self._mapper.schedule.why_not_mapped(current.index)
+        camera = current.frame.camera
+        if not reason and min(camera.width, camera.height) < MIN_SIDE:
+            reason = (
+                f'frames of {camera.width}x{camera.height} pixels are too small to track, at least {MIN_SIDE}x{MIN_SIDE} are needed'
+            )
         if not reason and not seen.device.valid.any():
             reason = 'no pixel has a usable depth reading'
         if not reason:

@@ -41,7 +41,7 @@ def mapped() -> Slam:
     results = [slam.process(sequence[index]) for index in range(3)]
     assert [result.status for result in results] == [Status.INITIALIZED, Status.TRACKED, Status.TRACKED]
     error = se3.inverse(se3.inverse(truth[0]) @ truth[2]) @ results[2].T_world_cam
-    assert np.linalg.norm(error[:3, 3]) < 0.015  # half a pixel at the walls' 2.5 m, as with isotropic Gaussians
+    assert np.linalg.norm(error[:3, 3]) < 0.02  # two thirds of a pixel at the walls' 2.5 m, as with isotropic Gaussians
     return slam
 
 

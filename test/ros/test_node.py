@@ -417,7 +417,7 @@ def test_bad_input_is_a_warning_each_and_the_node_goes_on(graph: Graph, frames: 
     send_good()
     send_bad('colour skipped', "'nv99'", rgb__encoding='nv99')
     send_bad('depth skipped', "'rgb8'", depth__encoding='rgb8')
-    send_bad('CameraInfo skipped', 'not calibrated', info__k=np.zeros(9))
+    send_bad('CameraInfo skipped', 'K is all zero', info__k=np.zeros(9))
     wide = frames[0]
     send_bad('frame skipped', '64x48', '32x48', 'aligned_depth_to_color', depth__width=32, depth__step=128,
              depth__data=images.depth_message(MAKE, wide.depth_m[:, :32], 0, '').data)  # fmt: skip
