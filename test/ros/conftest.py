@@ -13,12 +13,11 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from graph import ROOT, Graph
+from graph import FRAMES, ROOT, Graph
 
 from splatam_core.datasets.convert import write_bag
 from splatam_core.datasets.synthetic import SyntheticSequence
 
-FRAMES = 12
 TF2_PREFIX = ROOT / 'build' / 'tf2_msgs' / sys.implementation.cache_tag
 
 

@@ -22,6 +22,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from splatam_core.resources import config_dir
 
 ROOT = Path(__file__).resolve().parents[2]
+FRAMES = 12  # of the small recording that most tests play
 TIMEOUT_S = 60.0  # only ever waited out when a test fails; two busy cores make everything slow
 RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 from camera import CAMERA_FRAME, LATCHED, MAKE, QUICK, SLAM, Camera, run_node, stamps_of, still
-from conftest import FRAMES
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from graph import TIMEOUT_S, Graph, Process, node_arguments
+from graph import FRAMES, TIMEOUT_S, Graph, Process, node_arguments
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import ReliabilityPolicy
