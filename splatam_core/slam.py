@@ -11,7 +11,7 @@ from splatam_core.mapping.posed import PosedFrame
 from splatam_core.tracking.verdict import verify
 from splatam_core.types import FrameResult, RgbdFrame, Status
 
-MIN_SIDE = 16  # pixels
+MIN_SIDE = 8  # pixels
 
 
 class Slam(SlamLifecycle):
