@@ -18,7 +18,8 @@ from msg_adapters import rvl, stamps
 from msg_adapters.encodings import Depth, DepthEncoding, Rgb, clean_metres, metres_from_counts
 from msg_adapters.errors import MessageError
 from msg_adapters.factory import MessageFactory
-from msg_adapters.image_size import JPEG, PNG, Size, check_color_size, check_depth_size, stated_size
+from msg_adapters.image_headers import JPEG, PNG, Size, stated_size
+from msg_adapters.image_size import check_color_size, check_depth_size
 from msg_adapters.pixels import checked_depth, checked_rgb, millimetres
 
 _CONFIG = struct.Struct('<iff')

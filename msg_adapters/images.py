@@ -16,7 +16,7 @@ from msg_adapters.compressed import compressed_color_message, compressed_depth_m
 from msg_adapters.encodings import MILLIMETRE, Depth, DepthEncoding, Rgb
 from msg_adapters.errors import MessageError
 from msg_adapters.factory import MessageFactory
-from msg_adapters.image_size import Size
+from msg_adapters.image_headers import Size
 from msg_adapters.pixels import checked_depth, checked_mono, checked_rgb, millimetres
 
 __all__ = [

@@ -16,6 +16,7 @@ PACKAGES = ('msg_adapters', 'splatam_core', 'splatam_ros')
 
 BAG_READER = 'splatam_core.datasets.bag'  # a package
 EXR_READER = 'splatam_core.datasets.files'
+IMAGE_HEADERS = 'msg_adapters.image_headers'
 TRITON = 'splatam_core.rasterizer.triton'  # a package
 OPTIONAL = {'lpips': 'splatam_core.evaluation.similarity', 'open3d': 'splatam_core.maps.export'}
 MESSAGES = {
@@ -134,6 +135,8 @@ def breach(module: str, imported: Import) -> str | None:
         return None
     if package == 'msg_adapters' and imported.top in MESSAGES | {'rosbags'}:
         return None if imported.deferred else 'message classes are imported only where one is built'
+    if is_inside(imported.name, IMAGE_HEADERS) and package == 'splatam_core':
+        return None
     if imported.top in ('backports', 'msg_adapters', 'rosbags') and is_inside(module, BAG_READER):
         return None
     if imported.top == 'OpenEXR' and module == EXR_READER:

@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from msg_adapters.image_headers import EXR, stated_size, too_large
 from splatam_core.errors import DatasetError, one_line
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 from splatam_core.geometry.trajectory import LARGEST_POSITION_M, too_many
-from splatam_core.images.headers import EXR, stated_size, too_large
 from splatam_core.text_files import read_bytes, read_text
 from splatam_core.text_files import read_json as read_any_json
 

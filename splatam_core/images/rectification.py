@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from msg_adapters.image_headers import MAX_PIXELS
 from splatam_core.errors import CameraError, FrameError
 from splatam_core.geometry.camera import MAX_SIDE, CameraCalibration, PinholeCamera
-from splatam_core.images.headers import MAX_PIXELS
 from splatam_core.types import RgbdFrame
 
 Value = TypeVar('Value', np.uint8, np.float32)

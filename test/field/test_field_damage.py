@@ -17,6 +17,7 @@ from field_folders import FRAMES, tum
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from msg_adapters.image_headers import MAX_PIXELS, stated_size
 from splatam_core.cli import main
 from splatam_core.config import load_config, parse_overrides
 from splatam_core.datasets import files
@@ -26,7 +27,6 @@ from splatam_core.errors import CameraError, ConfigError, DatasetError, SplatamE
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 from splatam_core.geometry.stamps import SECONDS, guess_unit, stamp_from_text, stamp_number, stamp_text
 from splatam_core.geometry.trajectory import read_ground_truth, read_trajectory
-from splatam_core.images.headers import MAX_PIXELS, stated_size
 from splatam_core.images.rectification import FrameFactory
 from splatam_core.text_files import parse_json, parse_yaml
 
@@ -242,6 +242,12 @@ def test_header_states_what_is_decoded(tmp_path, suffix):
 def test_any_header_is_a_size_or_none(magic, data):
     size = stated_size(magic + data)
     assert size is None or all(isinstance(side, int) for side in size)
+
+
+@pytest.mark.parametrize('junk', [b'', b'\xff', b'\xff\x00', b'junk', b'\xff\xd0\xff\x01'])
+def test_a_jpeg_states_its_size_behind_what_decoders_skip(junk):
+    jpeg = cv2.imencode('.jpg', np.zeros((48, 64, 3), np.uint8))[1].tobytes()
+    assert stated_size(jpeg[:2] + junk + jpeg[2:]) == (64, 48)
 
 
 # --- stamps and poses ---

@@ -10,15 +10,20 @@ import struct
 MAX_PIXELS = 2**26
 """The largest image that is decoded, 8192x8192."""
 
+Size = tuple[int, int]
+"""Width and height in pixels."""
+
 PNG, JPEG, EXR = b'\x89PNG\r\n\x1a\n', b'\xff\xd8', b'\x76\x2f\x31\x01'
 BMP, TIFF_LITTLE, TIFF_BIG, RIFF = b'BM', b'II*\0', b'MM\0*', b'RIFF'
 FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """JPEG markers that are followed by the size (ITU-T T.81, table B.1)."""
 
-WITHOUT_LENGTH = frozenset({0x01, *range(0xD0, 0xD9)})
+WITHOUT_LENGTH = frozenset({0x00, 0x01, *range(0xD0, 0xD8)})
+END_OF_HEADER = frozenset({0xD9, 0xDA})
+"""The end of the image and the start of its pixels."""
 
 
-def stated_size(data: bytes) -> tuple[int, int] | None:
+def stated_size(data: bytes) -> Size | None:
     """Returns the width and height that a PNG, JPEG, OpenEXR, BMP, TIFF, WebP or PNM file states; None if it is none of them.
 
     Args:
@@ -30,7 +35,7 @@ def stated_size(data: bytes) -> tuple[int, int] | None:
         return None
 
 
-def too_large(size: tuple[int, int]) -> str:
+def too_large(size: Size) -> str:
     """Returns why an image of a size is not decoded; empty if it may be."""
     width, height = size
     if 0 < width * height <= MAX_PIXELS and min(size) > 0:
@@ -38,7 +43,7 @@ def too_large(size: tuple[int, int]) -> str:
     return f'claims to be {width}x{height} pixels; images of 1 to {MAX_PIXELS} pixels are read'
 
 
-def _stated_size(data: bytes) -> tuple[int, int] | None:
+def _stated_size(data: bytes) -> Size | None:
     if data.startswith(PNG):
         return _pair('>II', data, 16)
     if data.startswith(JPEG):
@@ -60,25 +65,25 @@ def _pair(form: str, data: bytes, offset: int) -> tuple[int, int]:
     return first, second
 
 
-def _jpeg(data: bytes) -> tuple[int, int] | None:
+def _jpeg(data: bytes) -> Size | None:
+    """Like decoders, it looks for the next marker and skips whatever stands before it."""
     at = 2
-    while at < len(data):
-        if data[at] != 0xFF:
-            return None
+    while (at := data.find(b'\xff', at)) >= 0:
         while data[at] == 0xFF:  # any number of fill bytes
             at += 1
         marker, at = data[at], at + 1
-        if marker in WITHOUT_LENGTH:
-            continue
         if marker in FRAME_HEADERS:
             height, width = _pair('>HH', data, at + 3)
             return width, height
-        (length,) = struct.unpack_from('>H', data, at)
-        at += max(length, 2)
+        if marker in END_OF_HEADER:
+            return None
+        if marker not in WITHOUT_LENGTH:
+            (length,) = struct.unpack_from('>H', data, at)
+            at += max(length, 2)
     return None
 
 
-def _exr(data: bytes) -> tuple[int, int] | None:
+def _exr(data: bytes) -> Size | None:
     """Returns the size of the largest part: each part has a header of attributes (name, type, length, value)."""
     is_multipart = bool(data[5] & 0x10)
     sizes, at = [], 8
@@ -105,7 +110,7 @@ def _c_string(data: bytes, at: int) -> tuple[bytes, int]:
     return data[at:end], end + 1
 
 
-def _tiff(data: bytes) -> tuple[int, int] | None:
+def _tiff(data: bytes) -> Size | None:
     order = '<' if data.startswith(TIFF_LITTLE) else '>'
     (at,) = struct.unpack_from(order + 'I', data, 4)
     (count,) = struct.unpack_from(order + 'H', data, at)
@@ -117,7 +122,7 @@ def _tiff(data: bytes) -> tuple[int, int] | None:
     return (found[256], found[257]) if len(found) == 2 else None
 
 
-def _webp(data: bytes) -> tuple[int, int] | None:
+def _webp(data: bytes) -> Size | None:
     kind = data[12:16]
     if kind == b'VP8X':
         return int.from_bytes(data[24:27], 'little') + 1, int.from_bytes(data[27:30], 'little') + 1
@@ -128,7 +133,7 @@ def _webp(data: bytes) -> tuple[int, int] | None:
     return (width & 0x3FFF, height & 0x3FFF) if kind == b'VP8 ' else None
 
 
-def _pnm(data: bytes) -> tuple[int, int] | None:
+def _pnm(data: bytes) -> Size | None:
     """Returns the first two numbers after the magic; comments begin with ``#``."""
     lines = [line.partition(b'#')[0] for line in data[:4096].split(b'\n')]
     words = b' '.join(lines).split()[1:3]
