@@ -9,6 +9,7 @@ import shutil
 import zlib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from damage import damages_of, jpeg, png
