@@ -13,6 +13,7 @@ from typing import Any
 
 import rclpy
 from domains import reserve_domain
+from forked import Forked, can_fork, fork
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -41,10 +42,8 @@ def environment(domain: int, log_folder: Path) -> dict[str, str]:
 class Process:
     """A process under test; its output goes into a file."""
 
-    def __init__(self, command: Sequence[str], environment: dict[str, str], log: Path, stdin: int = subprocess.DEVNULL) -> None:
-        self._log = log
-        with log.open('wb') as file:
-            self._process = subprocess.Popen(command, cwd=ROOT, env=environment, stdin=stdin, stdout=file, stderr=subprocess.STDOUT)
+    def __init__(self, arguments: Sequence[str], environment: dict[str, str], log: Path, stdin: int = subprocess.DEVNULL) -> None:
+        self._log, self._process = log, _started(arguments, environment, log, stdin)
 
     @property
     def text(self) -> str:
@@ -91,6 +90,15 @@ class Process:
             self._process.wait()
 
 
+def _started(arguments: Sequence[str], environment: dict[str, str], log: Path, stdin: int) -> subprocess.Popen[bytes] | Forked:
+    log.touch()
+    if stdin == subprocess.DEVNULL and can_fork(environment):
+        return fork(arguments, environment, log)
+    command = [sys.executable, *arguments]
+    with log.open('ab') as file:
+        return subprocess.Popen(command, cwd=ROOT, env=environment, stdin=stdin, stdout=file, stderr=subprocess.STDOUT)
+
+
 def wait_until(condition: Callable[[], object], timeout_s: float = TIMEOUT_S, explain: Callable[[], str] = lambda: '') -> None:
     deadline_s = time.monotonic() + timeout_s
     while not condition():
@@ -111,10 +119,10 @@ class Graph:
 
     # --- processes ---
 
-    def start(self, *command: str, stdin: int = subprocess.DEVNULL) -> Process:
+    def start(self, *arguments: str, stdin: int = subprocess.DEVNULL) -> Process:
         variables = environment(self.domain, self.folder)
         variables.pop('FASTRTPS_DEFAULT_PROFILES_FILE')  # they must find it themselves
-        process = Process([sys.executable, *command], variables, self.folder / f'process_{len(self._processes)}.log', stdin)
+        process = Process(arguments, variables, self.folder / f'process_{len(self._processes)}.log', stdin)
         self._processes.append(process)
         return process
 
