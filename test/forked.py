@@ -65,7 +65,8 @@ def fork(arguments: Sequence[str], environment: Mapping[str, str], output: Path)
         environment: all of it.
         output: an existing file; what the process says is added.
     """
-    return Forked(_server().start({'arguments': list(arguments), 'environment': dict(environment), 'output': str(output)}), arguments)
+    request = {'arguments': list(arguments), 'environment': dict(environment), 'output': str(output)}
+    return Forked(_server().start(request), arguments)
 
 
 class _Server:

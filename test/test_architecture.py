@@ -318,6 +318,7 @@ print(*sorted(loaded & set(sys.argv[2:])))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('package', 'never'),
     [

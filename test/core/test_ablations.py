@@ -16,6 +16,7 @@ SMALL = ['synthetic', '--width', '48', '--max-frames', '3', '--set', 'threads=1'
          '--set', 'mapping.iterations=2']  # fmt: skip
 
 
+@pytest.mark.slow
 def test_each_variant_changes_what_it_is_named_after_and_nothing_else() -> None:
     full, *others = variants(variant_names(), 'splatam')
     assert full.name == FULL and len(others) >= 9

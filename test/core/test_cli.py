@@ -211,6 +211,7 @@ def write_tum(folder: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_recording_without_truth_gives_null(tmp_path: Path) -> None:
     write_tum(tmp_path / 'tum')
     assert splatam('run', tmp_path / 'tum', *SETTINGS, '--out', tmp_path / 'run') == 0
@@ -218,6 +219,7 @@ def test_recording_without_truth_gives_null(tmp_path: Path) -> None:
     assert m['tracked'] == FRAMES and m['ate_rmse_m'] is None and m['psnr_db'] > 15
 
 
+@pytest.mark.slow
 def test_a_damaged_frame_is_left_out_and_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_tum(tmp_path / 'tum')
     (tmp_path / 'tum' / 'rgb' / '2.png').write_bytes(b'not an image')
@@ -237,6 +239,7 @@ def test_a_frame_of_another_size_is_left_out(tmp_path: Path, capsys: pytest.Capt
     assert metrics(tmp_path / 'run')['frames'] == FRAMES - 1
 
 
+@pytest.mark.slow
 def test_a_run_that_never_finds_its_way_is_still_reported(tmp_path: Path) -> None:
     write_tum(tmp_path / 'tum')
     for path in (tmp_path / 'tum' / 'depth').iterdir():
@@ -250,6 +253,7 @@ def test_a_run_that_never_finds_its_way_is_still_reported(tmp_path: Path) -> Non
     assert (tmp_path / 'run' / 'report.png').exists()
 
 
+@pytest.mark.slow
 def test_too_few_frames_for_a_trajectory_error_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     window = ['--width', WIDTH, '--max-frames', 2]
     assert splatam('run', SOURCE, *window, *SETTINGS, '--out', tmp_path / 'run') == 0
@@ -272,6 +276,7 @@ def long_run(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], Path]]:
     process.communicate()
 
 
+@pytest.mark.slow
 def test_interrupt_saves_what_was_done(long_run: tuple[subprocess.Popen[str], Path]) -> None:
     process, folder = long_run
     process.send_signal(signal.SIGINT)
@@ -286,6 +291,7 @@ def test_interrupt_saves_what_was_done(long_run: tuple[subprocess.Popen[str], Pa
     assert metrics(folder)['ate_rmse_m'] is not None
 
 
+@pytest.mark.slow
 def test_kill_keeps_the_trajectory(long_run: tuple[subprocess.Popen[str], Path]) -> None:
     process, folder = long_run
     process.kill()
@@ -317,6 +323,7 @@ def test_the_steps_after_the_last_frame_are_counted_and_are_not_of_a_run_that_wa
     assert 'final passes' not in capsys.readouterr().err and metrics(tmp_path / 'stopped')['finish_s'] == 0
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_the_map_is_fitted_once_more_saves_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -339,6 +346,7 @@ def test_ctrl_c_while_the_map_is_fitted_once_more_saves_it(
 # --- evaluate ---
 
 
+@pytest.mark.slow
 def test_evaluate_repeats_the_run_s_own_scores(finished: Path, copy: Path) -> None:
     (copy / 'report.png').unlink()
     assert splatam('evaluate', copy) == 0
@@ -346,6 +354,7 @@ def test_evaluate_repeats_the_run_s_own_scores(finished: Path, copy: Path) -> No
     assert (copy / 'report.png').exists()
 
 
+@pytest.mark.slow
 def test_node_and_command_line_are_scored_alike(finished: Path, of_the_node: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(of_the_node, tmp_path / 'node'))
     assert (folder / 'trajectory.txt').read_bytes() == (finished / 'trajectory.txt').read_bytes()
@@ -366,6 +375,7 @@ def write_truth(path: Path) -> None:
     path.write_text('\n'.join(map(pose_line, truth.stamps_ns.tolist(), truth.T_world_cam)))
 
 
+@pytest.mark.slow
 def test_truth_file_alone_gives_the_trajectory_error(finished: Path, of_the_node: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(of_the_node, tmp_path / 'node'))
     write_truth(tmp_path / 'truth.txt')
@@ -375,6 +385,7 @@ def test_truth_file_alone_gives_the_trajectory_error(finished: Path, of_the_node
     assert m['psnr_db'] is None and m['evaluated_every'] is None
 
 
+@pytest.mark.slow
 def test_truth_file_beside_the_run_s_own_images(finished: Path, copy: Path, tmp_path: Path) -> None:
     write_truth(tmp_path / 'truth.txt')
     assert splatam('evaluate', copy, '--truth', tmp_path / 'truth.txt') == 0
@@ -391,6 +402,7 @@ def test_truth_of_another_recording_is_an_error_that_changes_nothing(
     assert {entry.name: entry.read_bytes() for entry in copy.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_scores_stay_until_they_are_scored_again(copy: Path, of_the_node: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(of_the_node, tmp_path / 'node'))
     assert splatam('evaluate', folder, '--truth', SOURCE) == 0
@@ -408,6 +420,7 @@ def test_evaluate_of_no_run_is_one_line(tmp_path: Path, capsys: pytest.CaptureFi
 # --- convert ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
 def test_converted_bag_gives_the_same_run(finished: Path, tmp_path: Path, storage: str) -> None:
     bag = tmp_path / 'bag'
@@ -418,6 +431,7 @@ def test_converted_bag_gives_the_same_run(finished: Path, tmp_path: Path, storag
     assert metrics(tmp_path / 'run')['ate_rmse_m'] == pytest.approx(metrics(finished)['ate_rmse_m'], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_node_is_scored_with_the_bag_it_was_played(finished: Path, of_the_node: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(of_the_node, tmp_path / 'node'))
     assert splatam('convert', SOURCE, tmp_path / 'bag', *SMALL) == 0

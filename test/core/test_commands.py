@@ -166,6 +166,7 @@ def test_bench_runs_presets_and_compares_them(
         assert bench.description.source == Source('synthetic', start=1, max_frames=3, width=32)
 
 
+@pytest.mark.slow
 def test_bench_stops_at_a_preset_that_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert splatam('bench', tmp_path / 'nothing', '--presets', 'quick', '--out', tmp_path / 'b') == 2
     assert 'preset quick ended with exit code 2' in capsys.readouterr().err
@@ -228,6 +229,7 @@ def test_render_refuses_what_leaves_nothing(run: RunRecord, tmp_path: Path, caps
 # --- refine ---
 
 
+@pytest.mark.slow
 def test_refine_makes_a_better_map_and_leaves_the_run_alone(
     run: RunRecord, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -82,6 +82,7 @@ def test_settings_mean_what_they_meant(name: str) -> None:
     assert config == config_of(name) == read_newest(FIXTURES / name / CHECKPOINTS).state.config
 
 
+@pytest.mark.slow
 def test_a_run_folder_is_evaluated(name: str, run: Path) -> None:
     assert splatam('evaluate', run) == 0
     before, after = metrics(FIXTURES / name), metrics(run)

@@ -65,6 +65,7 @@ def _config(preset: str, *more: str) -> SlamConfig:
 TOLERANCE = {'splatam': 1e-4, 'realtime': 2e-4}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('preset', FEW_STEPS)
 def test_ten_frames_on_the_device_are_those_of_the_host(preset: str, room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing of ten frames touches the host's memory unasked, and from the same state both find the same pose."""

@@ -306,6 +306,7 @@ def check_page(text: str) -> Page:
     return page
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('with_ground_truth', 'with_images'), [(True, True), (False, True), (True, False), (False, False)])
 def test_page_is_complete_and_needs_nothing_else(tmp_path: Path, with_ground_truth: bool, with_images: bool) -> None:
     sequence = Wall()

@@ -216,6 +216,7 @@ def _python(code: str, *arguments: str, **environment: str) -> str:
     return run.stdout
 
 
+@pytest.mark.slow
 def test_tensors_of_the_cpu_need_the_interpreter() -> None:
     said = _python("""
 import torch
@@ -231,6 +232,7 @@ except Exception as error:
     assert 'TRITON_INTERPRET=1' in said and len(said.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_without_triton_the_error_says_what_to_install() -> None:
     said = _python("""
 import sys

@@ -367,6 +367,7 @@ def test_a_disk_that_is_full_at_the_first_frames_costs_no_frame_once_there_is_ro
     assert run.stamps_ns() == [result(index).stamp_ns for index in range(4)]
 
 
+@pytest.mark.slow
 def test_a_disk_that_stays_full_loses_whole_frames_and_bounds_the_memory(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path, CONFIG, NODE)
     with full_disk():
@@ -400,8 +401,8 @@ def frame_of_a_pixel(index: int) -> RgbdFrame:
 
 
 @pytest.mark.slow
-def test_a_million_frames_take_no_more_memory_than_half_of_them(tmp_path: Path) -> None:
-    """Nine hours at 30 Hz; a list of records would take 500 MB."""
+def test_the_last_of_a_million_frames_take_no_memory(tmp_path: Path) -> None:
+    """Nine hours at 30 Hz; a list of records would take 500 MB. Of the traced frames, even a list of numbers takes 400 kB."""
     folder, some = RunFolder.create(tmp_path, CONFIG, NODE), frame_of_a_pixel(0)
     pose = np.eye(4)
     for index in range(1_000_001):
@@ -412,18 +413,19 @@ def test_a_million_frames_take_no_more_memory_than_half_of_them(tmp_path: Path) 
             '', timings,
         )  # fmt: skip
         folder.append(some, frame_result, 0.01)
-        if index == 500_000:
+        if index == 950_000:
             tracemalloc.start()
     grown = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
     metrics = folder._statistics.metrics()
     folder.close()
-    assert grown < 1 << 20
+    assert grown < 1 << 17
     assert (metrics.frames, metrics.lost, metrics.fps) == (1_000_001, 990_000, 100.0)
     assert metrics.timings_ms['total'].median == pytest.approx(499.5, abs=5)
     assert metrics.timings_ms['total'].p95 == pytest.approx(949, abs=5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('count', [1, MAX_TIMINGS - 1, MAX_TIMINGS, 3 * MAX_TIMINGS + 5])
 def test_percentiles_are_exact_up_to_a_number_of_frames_and_close_beyond(count: int) -> None:
     rng, statistics = np.random.default_rng(0), FrameStatistics()

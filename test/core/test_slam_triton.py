@@ -48,6 +48,7 @@ def test_ten_frames_of_realtime_are_those_of_the_native_rasterizer(room: Room) -
         assert found.num_gaussians == pytest.approx(expected.num_gaussians, rel=0.01) and found.num_gaussians > 400
 
 
+@pytest.mark.slow
 def test_alignment_to_an_interpreted_render_finds_the_same_pose(room: Room) -> None:
     """From the same map: to 0.2 mm, a fiftieth of a pixel."""
     sequence, slam = room(3, 160), Slam(load_config('quick', ['threads=1', 'rasterizer=cpu']))
