@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +16,8 @@ from splatam_core.device import choose_backend, pose_tensor
 from splatam_core.errors import ConfigError, FrameError, SplatamError
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.images.observation import Observation
+from splatam_core.images.spacing import describe_spacing
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.mapper import Mapper
 from splatam_core.mapping.optimizers.base import TimeLimit, never
@@ -26,6 +29,7 @@ from splatam_core.tracking.motion import MotionModel, MotionPrior
 from splatam_core.types import FrameResult, MapSnapshot, RenderedView, RgbdFrame, Status
 
 Matrix = NDArray[np.float64]
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +96,7 @@ class SlamLifecycle:
         self._motion_prior, self._true_motion, self._recording_length = motion_prior, true_motion, num_frames
         self._rasterizer = make_rasterizer(self.backend.rasterizer, config.threads)
         self._tracker = make_tracker(self._rasterizer, config.tracking, config.threads, self.backend.device)
+        self._told_spacing = False
         self.reset()
 
     def reset(self) -> None:
@@ -221,6 +226,15 @@ class SlamLifecycle:
         self.camera = frame.camera
         index, self._num_frames, self._last_stamp_ns = self._num_frames, self._num_frames + 1, frame.stamp_ns
         return CurrentFrame(index, frame, Stopwatch(self.backend.device))
+
+    def _observe(self, frame: RgbdFrame) -> Observation:
+        """Returns the frame's images; says once that the depth has a grid of holes."""
+        seen = Observation.from_frame(frame, self.config.depth, self.backend.device)
+        spacing = max(frame.depth_spacing, seen.host.spacing)
+        if spacing > 1 and not self._told_spacing:
+            _log.warning('%s', describe_spacing(spacing))
+            self._told_spacing = True
+        return seen
 
     def _new_mapper(self) -> Mapper:
         return Mapper(self.config, self._rasterizer, self.backend.device, self._recording_length)

@@ -24,7 +24,7 @@ class Slam(SlamLifecycle):
             FrameError: the frame has another camera than the first one, or is not later than the last one.
         """
         current = self._admit(frame)
-        seen = Observation.from_frame(frame, self.config.depth, self.backend.device)
+        seen = self._observe(frame)
         if self.num_gaussians == 0:
             return self._initialize(current, seen)
 

@@ -25,6 +25,8 @@ class RgbdFrame:
         camera: pinhole camera of both images, after rectification.
         epoch: number of backward time jumps before this frame; stamps increase within an epoch.
         frame_id: coordinate frame of the colour image, as its ROS header names it; empty for recordings without one.
+        depth_spacing: mean distance in pixels between neighbouring readings before the frame was made smaller; 1 = dense, or it
+            was not made smaller.
     """
 
     stamp_ns: int
@@ -33,6 +35,7 @@ class RgbdFrame:
     camera: PinholeCamera
     epoch: int = 0
     frame_id: str = ''
+    depth_spacing: float = 1.0
 
 
 class Status(str, Enum):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from msg_adapters.image_headers import MAX_PIXELS
 from splatam_core.errors import CameraError, FrameError
 from splatam_core.geometry.camera import MAX_SIDE, CameraCalibration, PinholeCamera
+from splatam_core.images.spacing import reading_spacing, shrunk_readings
 from splatam_core.types import RgbdFrame
 
 Value = TypeVar('Value', np.uint8, np.float32)
@@ -23,8 +24,9 @@ MIN_SIDE = 16
 class FrameFactory:
     """Makes frames of one ideal camera from the images of one real camera.
 
-    Rectifies (colour bilinear, depth nearest) and resizes (colour by area when shrinking, depth nearest). Depth is measured
-    along the optical axis, so rectification moves readings but keeps their values.
+    Rectifies (colour bilinear, depth nearest) and resizes (colour by area when shrinking, depth nearest; where depth is a grid
+    with holes, the nearest reading). Depth is measured along the optical axis, so rectification moves readings but keeps their
+    values.
 
     Attributes:
         calibration: the camera that took the images.
@@ -110,13 +112,16 @@ class FrameFactory:
             rgb = _remapped(rgb, self._maps, cv2.INTER_LINEAR)
         if self._depth_maps is not None:
             depth_m = _remapped(depth_m, self._depth_maps, cv2.INTER_NEAREST)
-        size = (self.camera.width, self.camera.height)
+        size, spacing = (self.camera.width, self.camera.height), 1.0
         if size != (self._pinhole.width, self._pinhole.height):
             shrinking = size[0] < self._pinhole.width
             rgb = _resized(rgb, size, cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)
-            depth_m = _resized(depth_m, size, cv2.INTER_NEAREST_EXACT)
-        depth_m = kept(depth_m, (depth_m > 0) & (depth_m < np.inf))
-        return RgbdFrame(stamp_ns, np.ascontiguousarray(rgb), depth_m, self.camera)
+            spacing = reading_spacing(depth_m) if shrinking else 1.0
+            if spacing == 1.0:
+                depth_m = _resized(depth_m, size, cv2.INTER_NEAREST_EXACT)
+            else:
+                depth_m = shrunk_readings(_clean(depth_m), *size)
+        return RgbdFrame(stamp_ns, np.ascontiguousarray(rgb), _clean(depth_m), self.camera, depth_spacing=spacing)
 
     def _at_colour_size(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
         width, height = self.calibration.pinhole.width, self.calibration.pinhole.height
@@ -178,6 +183,11 @@ def kept(depth_m: NDArray[np.floating[Any]], chosen: NDArray[np.bool_]) -> NDArr
     readings = np.zeros(depth_m.shape, np.float32)
     np.copyto(readings, depth_m, where=chosen, casting='same_kind')
     return readings
+
+
+def _clean(depth_m: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    """Returns [H, W] with 0 where there is no reading."""
+    return kept(depth_m, (depth_m > 0) & (depth_m < np.inf))
 
 
 def _resized(image: NDArray[Value], size: tuple[int, int], interpolation: int) -> NDArray[Value]:

@@ -15,6 +15,7 @@ from splatam_core.config import DepthConfig
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.images.filters import nearest, shrunk
 from splatam_core.images.rectification import kept
+from splatam_core.images.spacing import reading_spacing, shrunk_readings, spacing_of_grid
 from splatam_core.types import RgbdFrame
 
 
@@ -26,23 +27,27 @@ class View:
         camera: the pinhole of both images.
         rgb8: [H, W, 3] uint8.
         depth: [H, W] metres, 0 = no reading.
+        spacing: mean distance in pixels between neighbouring readings; more than 1 if they are a grid with holes.
     """
 
     camera: PinholeCamera
     rgb8: Tensor
     depth: Tensor
+    spacing: float = 1.0
 
     @classmethod
     def from_frame(cls, frame: RgbdFrame, config: DepthConfig) -> View:
         """Returns the frame's images in the host's memory, with the depth readings that are used (see ``usable_depth``)."""
         depth_m = usable_depth(frame.depth_m, config)
-        return cls(frame.camera, torch.from_numpy(np.ascontiguousarray(frame.rgb)), torch.from_numpy(depth_m))
+        rgb8 = torch.from_numpy(np.ascontiguousarray(frame.rgb))
+        return cls(frame.camera, rgb8, torch.from_numpy(depth_m), reading_spacing(depth_m))
 
     def to(self, device: torch.device) -> View:
         """Returns the view on a device; itself if it is there already."""
         if self.depth.device == device:
             return self
-        return View(self.camera, self.rgb8.to(device, non_blocking=True), self.depth.to(device, non_blocking=True))
+        rgb8, depth = self.rgb8.to(device, non_blocking=True), self.depth.to(device, non_blocking=True)
+        return View(self.camera, rgb8, depth, self.spacing)
 
     @cached_property
     def rgb(self) -> Tensor:
@@ -55,11 +60,15 @@ class View:
         return self.depth > 0
 
     def scaled(self, scale: float) -> View:
-        """Returns the view resized: colour by area, depth by the nearest pixel."""
+        """Returns the view resized: colour by area, depth by the nearest pixel, or reading where depth is a grid with holes."""
         if scale == 1.0:
             return self
         size = max(1, round(self.camera.width * scale)), max(1, round(self.camera.height * scale))
-        return View(self.camera.resized(*size), shrunk(self.rgb8, *size), nearest(self.depth, *size))
+        camera, rgb8 = self.camera.resized(*size), shrunk(self.rgb8, *size)
+        if self.spacing == 1.0:
+            return View(camera, rgb8, nearest(self.depth, *size))
+        readings = shrunk_readings(self.depth.numpy(force=True), *size)
+        return View(camera, rgb8, torch.from_numpy(readings).to(self.depth.device), spacing_of_grid(readings > 0))
 
     def narrowed(self, scale: float, max_width: int) -> View:
         """Returns the view resized by ``narrowing``."""

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from splatam_core.config import DensificationConfig
 from splatam_core.images.filters import box_sums, median
+from splatam_core.images.spacing import WINDOW
 from splatam_core.images.view import View, unproject
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.rasterizer import Gaussians, Rasterizer, Render
+from splatam_core.rasterizer.base import BLUR_PX2
 
 MAX_BIAS = 0.1
 """As a fraction of the depth. A pixel that is off by more shows another surface."""
@@ -22,6 +26,15 @@ MIN_SQUARED_DEPTH = 0.01  # m^2: against division by zero
 
 MIN_NEW_DEPTH, MIN_NEW_FRACTION = 0.02, 0.01
 """Metres, and fraction of the depth: a smaller error is never taken for something new."""
+
+MAX_EXCESS = 1.5
+"""A single reading far from all others is not taken for farther from them than this many mean spacings."""
+
+MIN_SUPPORTERS, SAME_SURFACE = 2, 0.1
+"""A reading with fewer neighbours that differ by at most this fraction stands alone."""
+
+MAX_ALONE = 0.001
+"""As a fraction of the readings. More that stand alone are speckles."""
 
 
 def densify(
@@ -34,12 +47,13 @@ def densify(
         return rasterizer.render(gaussian_map.gaussians.detached(), view.camera, T_cam_world)
 
     with torch.no_grad():
-        chosen, depth = unexplained(render(), view, config), view.depth
-        added = gaussian_map.append(new_gaussians(view, chosen, depth, T_cam_world, config.opacity))
+        chosen = without_speckles(unexplained(render(), view, config), view)
+        depth, widths_px = view.depth, new_widths(view)
+        added = gaussian_map.append(new_gaussians(view, chosen, depth, T_cam_world, config.opacity, widths_px))
         chosen = chosen.masked_scatter(chosen, added)  # without those that were refused
         for _ in range(config.bias_correction_rounds):
             depth = corrected(depth, depth_bias(render(), view), view.depth)
-            gaussian_map.replace_last(new_gaussians(view, chosen, depth, T_cam_world, config.opacity))
+            gaussian_map.replace_last(new_gaussians(view, chosen, depth, T_cam_world, config.opacity, widths_px))
 
 
 def corrected(depth: Tensor, bias: Tensor, reading: Tensor) -> Tensor:
@@ -83,15 +97,71 @@ def _significant_error(depth: Tensor, view: View, config: DensificationConfig) -
     return (config.depth_noise_ratio * noise * squared).clamp(min=MIN_NEW_DEPTH) + MIN_NEW_FRACTION * view.depth
 
 
-def new_gaussians(view: View, chosen: Tensor, depth: Tensor, T_cam_world: Tensor, opacity: float) -> Gaussians:
-    """Returns one Gaussian for each chosen pixel [H, W]: at a depth [H, W], one pixel wide, in the pixel's colour."""
+def without_speckles(chosen: Tensor, view: View) -> Tensor:
+    """Returns the chosen pixels [H, W] without readings that stand alone, if there are many of them.
+
+    Stereo matching gives speckles at any depth. Nothing contradicts one in the sky, and it would grow there. Single readings
+    are also the last that is seen of a thin thing; they stay.
+    """
+    v, u = torch.nonzero(chosen, as_tuple=True)
+    reach = math.ceil(view.spacing) + 1
+    depth, z = functional.pad(view.depth, (reach,) * 4), view.depth[v, u]
+    supporters = torch.full_like(v, -1)  # not itself
+    for down, right in itertools.product(range(2 * reach + 1), repeat=2):
+        supporters += (depth[v + down, u + right] - z).abs() <= SAME_SURFACE * z
+    alone = supporters < MIN_SUPPORTERS
+    is_speckled = alone.sum() > MAX_ALONE * view.valid.sum()
+    return chosen.masked_scatter(chosen, ~(alone & is_speckled))
+
+
+def new_widths(view: View) -> Tensor | None:
+    """Returns [H, W] radii in pixels of new Gaussians, that close the surface between its readings; None: one pixel everywhere.
+
+    With its blur, a Gaussian covers as much of the distance to its neighbours as one of a dense image does.
+    """
+    if view.spacing == 1.0:
+        return None
+    return ((1 + BLUR_PX2) * _local_spacing(view.valid, view.spacing).square() - BLUR_PX2).sqrt()
+
+
+def _local_spacing(valid: Tensor, mean_spacing: float) -> Tensor:
+    """Returns [H, W] distances in pixels between neighbouring readings, at least 1.
+
+    At the border of a surface the readings of the surface alone count, so that it is not taken for sparser there.
+
+    Args:
+        valid: [H, W] bool, where there is a reading.
+        mean_spacing: see ``reading_spacing``.
+    """
+    image, half = valid.float()[None], WINDOW // 2
+    for window, padding in (((WINDOW, 1), (half, 0)), ((1, WINDOW), (0, half))):
+        image = functional.avg_pool2d(image, window, 1, padding, count_include_pad=False)
+    density = functional.max_pool2d(image, WINDOW, 1, half)[0, 1:-1, 1:-1]  # an even window adds a row and a column each time
+    return density.clamp(min=1 / WINDOW**2).rsqrt().clamp(1.0, MAX_EXCESS * mean_spacing)
+
+
+def new_gaussians(
+    view: View, chosen: Tensor, depth: Tensor, T_cam_world: Tensor, opacity: float, widths_px: Tensor | None = None
+) -> Gaussians:
+    """Returns one Gaussian for each chosen pixel [H, W]: at a depth [H, W], in the pixel's colour.
+
+    Args:
+        view: the images.
+        chosen: [H, W] bool.
+        depth: [H, W] metres.
+        T_cam_world: [4, 4] of the view.
+        opacity: of each Gaussian.
+        widths_px: [H, W] radii in pixels; None = one pixel.
+    """
     v, u = torch.nonzero(chosen, as_tuple=True)
     points = unproject(view.camera, u, v, depth[v, u])  # [K, 3]
     R, t = T_cam_world[:3, :3], T_cam_world[:3, 3]
-    focal = (view.camera.fx + view.camera.fy) / 2
+    radii = points[:, 2:] / ((view.camera.fx + view.camera.fy) / 2)  # [K, 1]
+    if widths_px is not None:
+        radii = radii * widths_px[v, u, None]
     return Gaussians(
         means=(points - t) @ R,
-        log_scales=torch.log(points[:, 2:] / focal),
+        log_scales=torch.log(radii),
         logit_opacities=points.new_full((len(points),), math.log(opacity / (1 - opacity))),
         rgb=view.rgb[:, v, u].T.contiguous(),
     )

@@ -113,4 +113,4 @@ class Mapper:
         if config.prune_scale > 0:
             added = self._config.densification
             focal = view.camera.fx * narrowing(view.camera.width, added.scale, added.max_width)
-            self.scene_radius = max(self.scene_radius, _MAX_GROWTH * deepest_m / focal / config.prune_scale)
+            self.scene_radius = max(self.scene_radius, _MAX_GROWTH * view.spacing * deepest_m / focal / config.prune_scale)

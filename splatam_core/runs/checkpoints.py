@@ -110,7 +110,7 @@ class Checkpoints:
             'rgb8': keyframe.view.rgb8.numpy(force=True), 'depth': keyframe.view.depth.numpy(force=True),
             'T_cam_world': keyframe.T_cam_world.numpy(force=True),
         }  # fmt: skip
-        file = pack(KEYFRAME, VERSION, Content({}, arrays))
+        file = pack(KEYFRAME, VERSION, Content({'spacing': keyframe.view.spacing}, arrays))
         file.write(_keyframe_path(self._folder, file.digest))
         return file.digest
 
@@ -238,7 +238,8 @@ def _read_keyframe(folder: Path, digest: str, camera: PinholeCamera | None) -> P
     path = _keyframe_path(folder, digest)
     if camera is None:
         raise CheckpointError(f'{path}: is no keyframe of this run, which has no camera')
-    arrays = read_archive(path, KEYFRAME, VERSION, digest).arrays
+    content = read_archive(path, KEYFRAME, VERSION, digest)
+    arrays, spacing = content.arrays, content.values.get('spacing', 1.0)  # dense before 0.3
     rgb8, depth, T_cam_world = (arrays[name] for name in ('rgb8', 'depth', 'T_cam_world'))
     if depth.ndim == 2 and depth.shape != (camera.height, camera.width):  # kept at another size (mapping.scale)
         height, width = depth.shape
@@ -250,7 +251,9 @@ def _read_keyframe(folder: Path, digest: str, camera: PinholeCamera | None) -> P
         raise CheckpointError(f'{path}: is no keyframe of this run: it holds {found}, expected {expected}')
     if not (np.isfinite(depth).all() and np.isfinite(T_cam_world).all()):
         raise CheckpointError(f'{path}: is no keyframe of this run: its depth or pose is not finite')
-    return PosedView(View(camera, torch.from_numpy(rgb8), torch.from_numpy(depth)), torch.from_numpy(T_cam_world))
+    if type(spacing) is not float or not 1 <= spacing < math.inf:
+        raise CheckpointError(f'{path}: is no keyframe of this run: spacing = {spacing!r}, expected at least 1')
+    return PosedView(View(camera, torch.from_numpy(rgb8), torch.from_numpy(depth), spacing), torch.from_numpy(T_cam_world))
 
 
 def _keyframe_path(folder: Path, digest: str) -> Path:
