@@ -22,6 +22,7 @@ EDGE = 0.05
 
 _MAX_HOLE = 0.025  # of the width: wider holes of the depth stay open
 _COARSEST_PX = 32  # smaller images show too little to align
+_LEAST_SILHOUETTE = 1e-3  # to divide by
 _DEPTH_LAYER = 3
 
 
@@ -56,12 +57,16 @@ def frame_level(view: View, aligner: Aligner[Any]) -> Level:
 
 
 def render_level(render: Render, camera: PinholeCamera, silhouette_threshold: float) -> Level:
-    """Returns a render at its full resolution, with depth where the silhouette is above the threshold."""
+    """Returns a render at its full resolution, with depth where the silhouette is above the threshold.
+
+    Where Gaussians of two frames meet, the silhouette dips and the black behind them shows. The brightness is that without it.
+    """
     visible = render.silhouette > silhouette_threshold
-    if not is_on_host(render.rgb):
-        return Level(camera, luminance(render.rgb.permute(1, 2, 0)), torch.where(visible, render.depth(), torch.nan))
+    rgb = (render.rgb / render.silhouette.clamp(min=max(silhouette_threshold, _LEAST_SILHOUETTE))).permute(1, 2, 0)
+    if not is_on_host(rgb):
+        return Level(camera, luminance(rgb), torch.where(visible, render.depth(), torch.nan))
     depth = np.where(visible.numpy(), render.depth().numpy(), np.float32(np.nan))
-    return Level(camera, _brightness(np.ascontiguousarray(render.rgb.permute(1, 2, 0).numpy())), depth)
+    return Level(camera, _brightness(np.ascontiguousarray(rgb.numpy())), depth)
 
 
 def half_pyramid(level: Level, aligner: Aligner[Any]) -> list[Level]:
