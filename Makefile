@@ -14,13 +14,14 @@ TEST_WORKERS ?= 2
 export SPLATAM_DATA ?= $(abspath ../shared/data)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup test test-quick sanitize lint format docs hooks tf2_msgs demo paper-tables colcon check-aarch64 clean
+.PHONY: help setup test test-quick sanitize sanitize-threads lint format docs hooks tf2_msgs demo paper-tables colcon check-aarch64 clean
 
 help:
 	@echo 'make setup           create $(VENV), build the native code and install the package (PYTHON=python3.11 chooses the interpreter)'
 	echo 'make test-quick      run the fast tests: no ROS processes, no recordings, under 2 minutes'
 	echo 'make test            run every test, $(TEST_WORKERS) at a time (TEST_WORKERS=4 changes that)'
 	echo 'make sanitize        run the native code'"'"'s tests with the address and undefined-behaviour sanitizers of g++'
+	echo 'make sanitize-threads run the tests of threads with the thread sanitizer of g++'
 	echo 'make lint            check style, types and spelling: ruff, mypy, codespell, clang-format'
 	echo 'make format          rewrite Python and C++ files in the project'"'"'s format'
 	echo 'make docs            build the documentation site in build/site and check its links'
@@ -81,6 +82,19 @@ sanitize: setup
 	export ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1
 	SPLATAM_NATIVE=$$(find build/sanitize -name '_native*.so') LD_PRELOAD=$$preload \
 		$(BIN)/python -m pytest -q -p no:cacheprovider $(SANITIZED_TESTS)
+
+# Data races of the native code. Python, torch and numpy are not built with the sanitizer, so only their locks are seen.
+# setarch: the sanitizer of g++ 12 needs addresses that are not randomised.
+THREAD_TESTS := test/core/test_threads.py test/core/test_worker.py
+sanitize-threads: setup
+	@flags='-fsanitize=thread -fno-omit-frame-pointer -O1 -g'
+	SPLATAM_CXXFLAGS=$$flags $(BIN)/python setup.py --quiet build_ext --force --build-lib build/sanitize-threads \
+		--build-temp build/sanitize-threads/objects
+	preload=
+	for library in tsan stdc++; do preload+="$$(g++ -print-file-name=lib$$library.so) "; done
+	export TSAN_OPTIONS='ignore_noninstrumented_modules=1 second_deadlock_stack=1 exitcode=66'
+	SPLATAM_NATIVE=$$(find build/sanitize-threads -name '_native*.so') LD_PRELOAD=$$preload setarch -R \
+		$(BIN)/python -m pytest -q -p no:cacheprovider $(THREAD_TESTS)
 
 # Runs every check, also after one has failed, and names those that failed.
 lint: setup $(VENV)/.docs

@@ -25,7 +25,7 @@ MAX_STEPS, MAX_SAMPLES, MAX_FRAMES = 100_000, 1_000_000, 10**9
 MAX_PX = 65_536
 MAX_SEED = 2**63 - 1
 DEVICES = ('auto', 'cpu', 'cuda')
-WHERE = frozenset({'device', 'rasterizer', 'keyframes.on_device'})
+WHERE = frozenset({'device', 'rasterizer', 'threads', 'keyframes.on_device'})
 """Settings that say where SLAM is computed, and do not change its result by more than rounding."""
 
 
@@ -308,7 +308,10 @@ class SlamConfig:
         minimum=0,
         maximum=MAX_PX,
     )
-    threads: int = setting(0, 'CPU threads; 0 = all cores, 1 = results repeat bit for bit.', minimum=0, maximum=256)
+    threads: int = setting(
+        0, 'CPU threads; 0 = one per core. Results do not depend on it. Set it to keep some cores free for other processes.',
+        minimum=0, maximum=256,
+    )  # fmt: skip
     device: str = setting(
         'auto', 'Where the map lives and is computed; auto = a GPU where torch sees one and triton is installed, else the CPU.',
         choices=DEVICES,

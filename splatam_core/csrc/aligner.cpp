@@ -9,6 +9,9 @@ namespace splatam {
 namespace {
 
 constexpr float kNone = std::numeric_limits<float>::quiet_NaN();
+constexpr int kRowsPerPiece = 16;  // of an image, or columns
+
+int pieces_of(int rows) { return (rows + kRowsPerPiece - 1) / kRowsPerPiece; }
 
 // Returns the upper edge of the bin that holds the median; tally() defines the bins.
 float median(const std::uint32_t* bins) {
@@ -52,35 +55,37 @@ void fill_line(float* line, int count, std::size_t stride, int max_gap, float ma
 
 }  // namespace
 
+// Calls task(piece, worker, begin, end) for rows [begin, end), piece by piece.
 template <typename Task>
-void Aligner::for_rows(int rows, Task&& task) {
-  const int parts = pool_.size();
-  pool_.run([&](int thread) { task(thread, rows * thread / parts, rows * (thread + 1) / parts); });
+void Aligner::for_rows(int rows, const Task& task) {
+  pool_.run(threads_, std::size_t(pieces_of(rows)), [&](std::size_t piece, int worker) {
+    const int begin = int(piece) * kRowsPerPiece;
+    task(int(piece), worker, begin, std::min(rows, begin + kRowsPerPiece));
+  });
 }
 
 Aligner::Result Aligner::linearize(const float* brightness, const float* depth, const Camera& camera,
                                    const float* layers, const Pose& color_motion, const Pose& depth_motion,
                                    const AlignmentSettings& settings) {
-  std::vector<AlignmentSums> sums(pool_.size());
-  std::vector<ResidualHistogram> histograms(pool_.size());
-  for_rows(camera.height, [&](int thread, int begin, int end) {
-    kernels_.align(brightness, depth, camera, begin, end, layers, color_motion, depth_motion, settings, sums[thread],
-                   histograms[thread]);
+  std::vector<AlignmentSums> sums(pieces_of(camera.height));  // added in order, because sums of floats depend on it
+  std::vector<ResidualHistogram> histograms(threads_);        // counts do not
+  for_rows(camera.height, [&](int piece, int worker, int begin, int end) {
+    kernels_.align(brightness, depth, camera, begin, end, layers, color_motion, depth_motion, settings, sums[piece],
+                   histograms[worker]);
   });
-  for (int thread = 1; thread < pool_.size(); ++thread) {
-    add(sums[0], sums[thread]);
+  for (std::size_t piece = 1; piece < sums.size(); ++piece) add(sums[0], sums[piece]);
+  for (int worker = 1; worker < threads_; ++worker)
     for (int bin = 0; bin < kResidualBins; ++bin) {
-      histograms[0].photometric[bin] += histograms[thread].photometric[bin];
-      histograms[0].depth[bin] += histograms[thread].depth[bin];
+      histograms[0].photometric[bin] += histograms[worker].photometric[bin];
+      histograms[0].depth[bin] += histograms[worker].depth[bin];
     }
-  }
   return {sums[0], median(histograms[0].photometric), median(histograms[0].depth)};
 }
 
 void Aligner::halve(const float* brightness, const float* depth, int width, int height, float max_step,
                     float* half_brightness, float* half_depth) {
   const int columns = width / 2;
-  for_rows(height / 2, [&](int, int begin, int end) {
+  for_rows(height / 2, [&](int, int, int begin, int end) {
     for (int y = begin; y < end; ++y)
       for (int x = 0; x < columns; ++x) {
         const std::size_t a = std::size_t(2 * y) * width + 2 * x, b = a + width;
@@ -96,17 +101,17 @@ void Aligner::halve(const float* brightness, const float* depth, int width, int 
 }
 
 void Aligner::fill_holes(float* depth, int width, int height, int max_gap, float max_step) {
-  for_rows(height, [&](int, int begin, int end) {
+  for_rows(height, [&](int, int, int begin, int end) {
     for (int y = begin; y < end; ++y) fill_line(depth + std::size_t(y) * width, width, 1, max_gap, max_step);
   });
-  for_rows(width, [&](int, int begin, int end) {
+  for_rows(width, [&](int, int, int begin, int end) {
     for (int x = begin; x < end; ++x) fill_line(depth + x, height, std::size_t(width), max_gap, max_step);
   });
 }
 
 void Aligner::layers(const float* brightness, const float* depth, int width, int height, float max_step,
                      float* layers) {
-  for_rows(height, [&](int, int begin, int end) {
+  for_rows(height, [&](int, int, int begin, int end) {
     for (int y = begin; y < end; ++y)
       for (int x = 0; x < width; ++x) {
         const std::size_t at = std::size_t(y) * width + x;

@@ -1,4 +1,5 @@
-// Direct alignment of a frame to a reference image of the same camera, on several threads.
+// Direct alignment of a frame to a reference image of the same camera, on several threads. Calls may come from several
+// threads at once. Results do not depend on the number of threads, bit for bit.
 #pragma once
 
 #include <vector>
@@ -10,14 +11,16 @@ namespace splatam {
 
 class Aligner {
  public:
-  explicit Aligner(int threads) : kernels_(best_kernels()), pool_(threads) {}
+  explicit Aligner(int threads) : kernels_(best_kernels()), threads_(threads), pool_(ThreadPool::of_process()) {
+    pool_.reserve(threads);
+  }
 
   struct Result {
     AlignmentSums sums;
     float photometric_median, depth_median;  // of the absolute residuals
   };
 
-  // Linearises the residuals. The result is repeatable for a fixed number of threads.
+  // Linearises the residuals.
   Result linearize(const float* brightness, const float* depth, const Camera&, const float* layers,
                    const Pose& color_motion, const Pose& depth_motion, const AlignmentSettings&);
 
@@ -35,10 +38,11 @@ class Aligner {
 
  private:
   template <typename Task>
-  void for_rows(int rows, Task&& task);
+  void for_rows(int rows, const Task& task);
 
   const Kernels& kernels_;
-  ThreadPool pool_;
+  const int threads_;
+  ThreadPool& pool_;
 };
 
 }  // namespace splatam

@@ -197,8 +197,11 @@ py::tuple halve(Aligner& aligner, const py::object& brightness, const py::object
   const GivenLevel level = level_of(brightness, depth);
   const int width = int(level.size.width), height = int(level.size.height);
   Array half_brightness({height / 2, width / 2}), half_depth({height / 2, width / 2});
-  aligner.halve(level.brightness, level.depth, width, height, max_step, half_brightness.mutable_data(),
-                half_depth.mutable_data());
+  float *brightness_out = half_brightness.mutable_data(), *depth_out = half_depth.mutable_data();
+  {
+    py::gil_scoped_release release;
+    aligner.halve(level.brightness, level.depth, width, height, max_step, brightness_out, depth_out);
+  }
   return py::make_tuple(half_brightness, half_depth);
 }
 
@@ -206,8 +209,13 @@ Array fill_holes(Aligner& aligner, const py::object& depth, int max_gap, float m
   const Size size = size_of(depth, "depth");
   const float* readings = values<float>(depth, "depth", {size.height, size.width});
   Array result({size.height, size.width});
-  std::copy(readings, readings + result.size(), result.mutable_data());
-  aligner.fill_holes(result.mutable_data(), int(size.width), int(size.height), max_gap, max_step);
+  float* filled = result.mutable_data();
+  const auto count = std::size_t(size.width * size.height);
+  {
+    py::gil_scoped_release release;
+    std::copy_n(readings, count, filled);
+    aligner.fill_holes(filled, int(size.width), int(size.height), max_gap, max_step);
+  }
   return result;
 }
 
@@ -215,7 +223,11 @@ Array layers(Aligner& aligner, const py::object& brightness, const py::object& d
   const GivenLevel level = level_of(brightness, depth);
   const int width = int(level.size.width), height = int(level.size.height);
   Array result({height, width, kLayers});
-  aligner.layers(level.brightness, level.depth, width, height, max_step, result.mutable_data());
+  float* data = result.mutable_data();
+  {
+    py::gil_scoped_release release;
+    aligner.layers(level.brightness, level.depth, width, height, max_step, data);
+  }
   return result;
 }
 

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <numeric>
 
 #include "engine.hpp"
 
@@ -10,6 +11,7 @@ namespace splatam {
 namespace {
 
 constexpr int kTileSize = 8;
+constexpr std::size_t kValues = kShape + kFeatures;
 constexpr int kTilePixels = kTileSize * kTileSize;
 constexpr float kMaximumAlpha = 0.99f, kMinimumAlpha = 1.0f / 255.0f, kMinimumTransmittance = 1e-4f;
 
@@ -37,21 +39,31 @@ std::shared_ptr<TileLists> list(const float* shapes, std::size_t count, int widt
   lists->tiles_x = (width + kTileSize - 1) / kTileSize, lists->tiles_y = (height + kTileSize - 1) / kTileSize;
   std::vector<Box> boxes(count);
   for (std::size_t i = 0; i < count; ++i) boxes[i] = box_of(shapes + kShape * i, width, height);
-  const auto for_each_tile = [&](const auto& visit) {
-    for (std::size_t i = 0; i < count; ++i) {
-      if (boxes[i].empty()) continue;
-      for (int y = boxes[i].top / kTileSize; y <= boxes[i].bottom / kTileSize; ++y)
-        for (int x = boxes[i].left / kTileSize; x <= boxes[i].right / kTileSize; ++x) visit(i, y * lists->tiles_x + x);
-    }
+  const auto for_each_row = [&](const auto& visit) {
+    for (std::size_t i = 0; i < count; ++i)
+      if (!boxes[i].empty())
+        for (int y = boxes[i].top / kTileSize; y <= boxes[i].bottom / kTileSize; ++y)
+          visit(i, y, y * lists->tiles_x + boxes[i].left / kTileSize, y * lists->tiles_x + boxes[i].right / kTileSize);
   };
-  auto& begins = lists->begins;
+  auto &begins = lists->begins, &member_begins = lists->member_begins;
   begins.assign(std::size_t(lists->tiles_x) * lists->tiles_y + 1, 0);
-  for_each_tile([&](std::size_t, int tile) { ++begins[tile + 1]; });
-  for (std::size_t tile = 1; tile < begins.size(); ++tile) begins[tile] += begins[tile - 1];
+  member_begins.assign(std::size_t(lists->tiles_y) + 1, 0);
+  for_each_row([&](std::size_t, int row, int first, int last) {
+    ++member_begins[row + 1];
+    for (int tile = first; tile <= last; ++tile) ++begins[tile + 1];
+  });
+  std::partial_sum(begins.begin(), begins.end(), begins.begin());
+  std::partial_sum(member_begins.begin(), member_begins.end(), member_begins.begin());
   check_entries(count, begins.back(), width, height);
   lists->entries.resize(begins.back());
-  auto next = begins;
-  for_each_tile([&](std::size_t i, int tile) { lists->entries[next[tile]++] = std::uint32_t(i); });
+  lists->members.resize(member_begins.back());
+  auto next = begins, next_member = member_begins;
+  for_each_row([&](std::size_t i, int row, int first, int last) {
+    const std::size_t member = next_member[row]++;
+    lists->members[member] = std::uint32_t(i);
+    for (int tile = first; tile <= last; ++tile)
+      lists->entries[next[tile]++] = std::uint32_t(member - member_begins[row]);
+  });
   return lists;
 }
 
@@ -84,9 +96,10 @@ void blend_tile(const TileLists& lists, int tile, const float* shapes, const flo
   const std::size_t size = std::size_t(lists.width) * lists.height;
   std::array<float, kTilePixels> transmittance;
   transmittance.fill(1.0f);
+  const std::uint32_t* members = lists.members.data() + lists.member_begins[tile / lists.tiles_x];
   for (std::size_t entry = lists.begins[tile]; entry < lists.begins[tile + 1]; ++entry) {
-    const float* shape = shapes + kShape * lists.entries[entry];
-    const float* feature = features + kFeatures * lists.entries[entry];
+    const std::uint32_t id = members[lists.entries[entry]];
+    const float *shape = shapes + kShape * id, *feature = features + kFeatures * id;
     for_each_covered(pixels, shape, lists.width, lists.height, transmittance.data(),
                      [&](int local, std::size_t pixel, float, float, float alpha) {
                        alpha = std::min(alpha, kMaximumAlpha);
@@ -100,9 +113,9 @@ void blend_tile(const TileLists& lists, int tile, const float* shapes, const flo
 
 // With w_i = alpha_i T_i and d_i the loss's gradient times the features of i, d loss / d alpha_i = T_i d_i - B_i / (1 -
 // alpha_i). B_i is the sum of w_k d_k over the ellipses k behind i: the sum over all of them, less those visited so
-// far.
+// far. Adds to sums, [members of the row, kShape + kFeatures].
 void blend_tile_back(const TileLists& lists, int tile, const float* shapes, const float* features, const float* image,
-                     const float* gradients, float* shape_gradients, float* feature_gradients) {
+                     const float* gradients, float* sums) {
   const Box pixels = pixels_of(lists, tile);
   const std::size_t size = std::size_t(lists.width) * lists.height;
   std::array<float, kTilePixels> transmittance, behind;
@@ -116,10 +129,11 @@ void blend_tile_back(const TileLists& lists, int tile, const float* shapes, cons
         sum += image[at] * gradients[at];
       }
     }
+  const std::uint32_t* members = lists.members.data() + lists.member_begins[tile / lists.tiles_x];
   for (std::size_t entry = lists.begins[tile]; entry < lists.begins[tile + 1]; ++entry) {
-    const std::uint32_t id = lists.entries[entry];
+    const std::uint32_t id = members[lists.entries[entry]];
     const float *shape = shapes + kShape * id, *feature = features + kFeatures * id;
-    float *by_shape = shape_gradients + kShape * id, *by_feature = feature_gradients + kFeatures * id;
+    float *by_shape = sums + kValues * lists.entries[entry], *by_feature = by_shape + kShape;
     for_each_covered(pixels, shape, lists.width, lists.height, transmittance.data(),
                      [&](int local, std::size_t pixel, float dx, float dy, float unlimited) {
                        const float alpha = std::min(unlimited, kMaximumAlpha);
@@ -151,31 +165,26 @@ std::shared_ptr<TileLists> Blender::forward(const float* shapes, const float* fe
                                             int height, float* image) {
   auto lists = list(shapes, count, width, height);
   std::fill_n(image, std::size_t(kChannels) * width * height, 0.0f);
-  const int tiles = int(lists->begins.size()) - 1;
-  pool_.run([&](int thread) {
-    for (int tile = thread; tile < tiles; tile += pool_.size()) blend_tile(*lists, tile, shapes, features, image);
+  pool_.run(threads_, std::size_t(lists->tiles_y), [&](std::size_t row, int) {
+    for (int x = 0; x < lists->tiles_x; ++x) blend_tile(*lists, int(row) * lists->tiles_x + x, shapes, features, image);
   });
   return lists;
 }
 
 void Blender::backward(const TileLists& lists, const float* shapes, const float* features, std::size_t count,
                        const float* image, const float* gradients, float* shape_gradients, float* feature_gradients) {
-  // Each tile belongs to a fixed thread, so that sums are repeatable bit for bit.
-  const std::size_t per_thread = count * (kShape + kFeatures);
-  std::vector<float> sums(per_thread * std::size_t(pool_.size()));
-  const int tiles = int(lists.begins.size()) - 1;
-  pool_.run([&](int thread) {
-    float* by_shape = sums.data() + per_thread * std::size_t(thread);
-    for (int tile = thread; tile < tiles; tile += pool_.size())
-      blend_tile_back(lists, tile, shapes, features, image, gradients, by_shape, by_shape + count * kShape);
+  std::vector<float> sums(lists.members.size() * kValues);  // row by row, so that their order is always the same
+  pool_.run(threads_, std::size_t(lists.tiles_y), [&](std::size_t row, int) {
+    float* of_row = sums.data() + lists.member_begins[row] * kValues;
+    for (int x = 0; x < lists.tiles_x; ++x)
+      blend_tile_back(lists, int(row) * lists.tiles_x + x, shapes, features, image, gradients, of_row);
   });
   std::fill_n(shape_gradients, count * kShape, 0.0f);
   std::fill_n(feature_gradients, count * kFeatures, 0.0f);
-  for (int thread = 0; thread < pool_.size(); ++thread) {
-    const float* by_shape = sums.data() + per_thread * std::size_t(thread);
-    const float* by_feature = by_shape + count * kShape;
-    for (std::size_t i = 0; i < count * kShape; ++i) shape_gradients[i] += by_shape[i];
-    for (std::size_t i = 0; i < count * kFeatures; ++i) feature_gradients[i] += by_feature[i];
+  for (std::size_t member = 0; member < lists.members.size(); ++member) {
+    const float* sum = sums.data() + member * kValues;
+    for (int i = 0; i < kShape; ++i) shape_gradients[kShape * lists.members[member] + i] += sum[i];
+    for (int i = 0; i < kFeatures; ++i) feature_gradients[kFeatures * lists.members[member] + i] += sum[kShape + i];
   }
 }
 

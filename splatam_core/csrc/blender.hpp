@@ -15,17 +15,21 @@ constexpr int kShape = 6;     // of an ellipse: u, v, inverse covariance xx xy y
 constexpr int kFeatures = 4;  // red, green, blue, z
 constexpr int kChannels = 5;  // of the image: the features and the silhouette
 
-// The ellipses that may touch each tile, front to back.
+// The ellipses that may touch each tile, front to back. A row of tiles has a list of its own of the ellipses that touch
+// it (members), so that a gradient can be summed row by row.
 struct TileLists {
   int width = 0, height = 0, tiles_x = 0, tiles_y = 0;
-  std::size_t count = 0;            // of the ellipses
-  std::vector<std::size_t> begins;  // tiles + 1
-  std::vector<std::uint32_t> entries;
+  std::size_t count = 0;                   // of the ellipses
+  std::vector<std::size_t> member_begins;  // rows + 1
+  std::vector<std::uint32_t> members;      // ellipses, row by row, front to back
+  std::vector<std::size_t> begins;         // tiles + 1
+  std::vector<std::uint32_t> entries;      // members, counted from the row's first, tile by tile
 };
 
+// Its results do not depend on the number of threads, bit for bit. Calls may come from several threads at once.
 class Blender {
  public:
-  explicit Blender(int threads) : pool_(threads) {}
+  explicit Blender(int threads) : threads_(threads), pool_(ThreadPool::of_process()) { pool_.reserve(threads); }
 
   // shapes: [count, kShape] front to back; features: [count, kFeatures]; image: [kChannels, height, width].
   std::shared_ptr<TileLists> forward(const float* shapes, const float* features, std::size_t count, int width,
@@ -36,7 +40,8 @@ class Blender {
                 const float* gradients, float* shape_gradients, float* feature_gradients);
 
  private:
-  ThreadPool pool_;
+  const int threads_;
+  ThreadPool& pool_;
 };
 
 }  // namespace splatam

@@ -5,19 +5,17 @@
 #include <cmath>
 #include <cstring>
 #include <limits>
+#include <numeric>
 #include <string>
 #include <utility>
 
 namespace splatam {
 namespace {
 
-constexpr int kDigitBits = 10;  // three digits hold every depth from 0.2 m on
+constexpr int kDigitBits = 10, kDigitsOfDepth = 3;  // hold every depth from 0.2 m on
 constexpr std::size_t kDigits = std::size_t(1) << kDigitBits;
 
 std::size_t blocks_of(std::size_t count) { return (count + kBlock - 1) / kBlock; }
-
-// Returns where part `index` of `parts` equal parts of a range begins.
-std::size_t part(std::size_t count, int index, int parts) { return count * std::size_t(index) / std::size_t(parts); }
 
 std::uint32_t depth_bits(float z) {
   std::uint32_t bits, near;
@@ -50,13 +48,134 @@ bool may_be_seen(const float* bounds, const Camera& camera, const Pose& pose) {
          inside(c[1], camera.fy, camera.cy) && inside(-c[1], camera.fy, float(camera.height - 1) - camera.cy);
 }
 
-// Calls visit(tile) for each tile that a splat touches.
+// Calls visit(row, columns) for each row of tiles that a splat touches.
 template <typename Visit>
-void visit_tiles(const TileRect& rect, int tiles_x, Visit&& visit) {
-  for (int y = rect.y0; y <= rect.y1; ++y) {
-    const int missed = (y == rect.y0 ? rect.missed_corners & 3 : 0) | (y == rect.y1 ? rect.missed_corners >> 2 : 0);
-    for (int x = rect.x0 + (missed & 1); x <= rect.x1 - (missed >> 1); ++x) visit(y * tiles_x + x);
+void visit_rows(const TileRect& rect, Visit&& visit) {
+  for (int row = rect.y0; row <= rect.y1; ++row) {
+    const int missed = (row == rect.y0 ? rect.missed_corners & 3 : 0) | (row == rect.y1 ? rect.missed_corners >> 2 : 0);
+    visit(row, Columns{std::uint16_t(rect.x0 + (missed & 1)), std::uint16_t(rect.x1 - (missed >> 1))});
   }
+}
+
+template <typename T>
+void grow(std::vector<T>& values, std::size_t count) {
+  if (values.size() < count) values.resize(count);
+}
+
+// Sorts by depth, in place or into `sorted`; returns which. Those of equal depth keep their order, which is that of the
+// lower half of a key.
+const std::uint64_t* sorted_by_depth(std::uint64_t* keys, std::uint64_t* sorted, std::size_t count) {
+  constexpr std::size_t kFew = 256;  // a radix sort has to clear its counters
+  if (count < kFew) {
+    std::sort(keys, keys + count);
+    return keys;
+  }
+  std::uint32_t places[kDigitsOfDepth][kDigits] = {};
+  const auto digit = [](std::uint64_t key, int index) { return key >> (32 + kDigitBits * index) & (kDigits - 1); };
+  for (std::size_t i = 0; i < count; ++i)
+    for (int index = 0; index < kDigitsOfDepth; ++index) ++places[index][digit(keys[i], index)];
+  for (int index = 0; index < kDigitsOfDepth; ++index) {  // the lowest digit first
+    std::uint32_t place = 0;
+    for (std::uint32_t& next : places[index]) place += std::exchange(next, place);
+    for (std::size_t i = 0; i < count; ++i) sorted[places[index][digit(keys[i], index)]++] = keys[i];
+    std::swap(keys, sorted);
+  }
+  return keys;
+}
+
+// Lists a row's members tile by tile, front to back.
+void list_tiles(View& view, int row, std::vector<std::uint64_t>& keys, std::vector<std::uint64_t>& sorted) {
+  const std::size_t first = view.member_begins[row], count = view.num_members(row);
+  grow(keys, count);
+  grow(sorted, count);
+  std::size_t *begins = view.tile_begins.data() + std::size_t(row) * view.tiles_x,
+              *ends = view.tile_ends.data() + std::size_t(row) * view.tiles_x;
+  // Counts where the members begin, and where they have ended, rather than all tiles between.
+  std::fill_n(begins, view.tiles_x, 0);
+  std::fill_n(ends, view.tiles_x, 0);
+  const Columns* columns = view.columns.data() + first;
+  for (std::size_t i = 0; i < count; ++i) {
+    keys[i] = std::uint64_t(depth_bits(view.members[first + i].z)) << 32 | i;
+    ++begins[columns[i].first];
+    if (columns[i].last + 1 < view.tiles_x) ++ends[columns[i].last + 1];
+  }
+  std::size_t place = view.entry_begins[row], open = 0;
+  for (int x = 0; x < view.tiles_x; ++x) {
+    open += begins[x] - ends[x];
+    begins[x] = ends[x] = place;
+    place += open;
+  }
+  const std::uint64_t* order = sorted_by_depth(keys.data(), sorted.data(), count);
+  std::uint32_t* entries = view.entries.data();
+  for (std::size_t i = 0; i < count; ++i) {
+    const std::uint32_t member = std::uint32_t(order[i]);
+    const Columns touched = columns[member];
+    for (int x = touched.first; x <= touched.last; ++x) entries[ends[x]++] = member;
+  }
+}
+
+// Calls visit(list, the row's members) for each tile of a row.
+template <typename Visit>
+void for_tiles(const View& view, int row, const Visit& visit) {
+  const Splat* members = view.members.data() + view.member_begins[row];
+  for (int x = 0; x < view.tiles_x; ++x) visit(view.tile(row * view.tiles_x + x), members);
+}
+
+// Finds where the members and the tile lists of each row begin.
+void divide_into_rows(View& view) {
+  const std::size_t rows = view.tiles_y;
+  std::vector<std::size_t> members(rows, 0), entries(rows, 0);
+  std::size_t visible = 0;
+  for (std::size_t block = 0; block < view.num_blocks; ++block) {
+    if (view.block_sizes[block] == 0) continue;
+    visible += view.block_sizes[block];
+    std::uint32_t *places = view.places.data() + rows * block, *widths = view.widths.data() + rows * block;
+    for (std::size_t row = 0; row < rows; ++row) {
+      entries[row] += widths[row];
+      members[row] += std::exchange(places[row], std::uint32_t(members[row]));
+    }
+  }
+  view.member_begins.assign(1, 0);
+  view.entry_begins.assign(1, 0);
+  for (std::size_t row = 0; row < rows; ++row) {
+    view.member_begins.push_back(view.member_begins[row] + members[row]);
+    view.entry_begins.push_back(view.entry_begins[row] + entries[row]);
+  }
+  check_entries(visible, view.entry_begins[rows], view.camera.width, view.camera.height);
+  view.longest_first.resize(rows);
+  std::iota(view.longest_first.begin(), view.longest_first.end(), 0);
+  std::stable_sort(view.longest_first.begin(), view.longest_first.end(),
+                   [&](int a, int b) { return entries[a] > entries[b]; });
+  grow(view.members, view.member_begins[rows]);
+  grow(view.columns, view.member_begins[rows]);
+  grow(view.entries, view.entry_begins[rows]);
+  grow(view.tile_begins, rows * view.tiles_x);
+  grow(view.tile_ends, rows * view.tiles_x);
+}
+
+// Where the next splat of a block is among the members of each row.
+class RowPlaces {
+ public:
+  RowPlaces(const View& view, std::size_t block) {
+    const std::uint32_t* places = view.places.data() + std::size_t(view.tiles_y) * block;
+    for (int row = 0; row < view.tiles_y; ++row) next_[row] = std::uint32_t(view.member_begins[row]) + places[row];
+  }
+
+  std::size_t take(int row) { return next_[row]++; }
+
+ private:
+  std::uint32_t next_[kMaxTiles];
+};
+
+void copy_members(View& view, std::size_t block) {
+  if (view.block_sizes[block] == 0) return;
+  RowPlaces next(view, block);
+  for (std::size_t splat = block * kBlock; splat < block * kBlock + view.block_sizes[block]; ++splat)
+    visit_rows(view.rects[splat], [&](int row, Columns columns) {
+      const std::size_t member = next.take(row);
+      view.members[member] = view.splats[splat];
+      view.columns[member] = columns;
+    });
 }
 
 }  // namespace
@@ -76,7 +195,12 @@ void check_entries(std::size_t count, std::size_t entries, int width, int height
 
 TileList View::tile(int index) const {
   const std::size_t begin = tile_begins[index];
-  return {index % tiles_x * kTile, index / tiles_x * kTile, entries.data() + begin, tile_begins[index + 1] - begin};
+  return {index % tiles_x * kTile, index / tiles_x * kTile, entries.data() + begin, tile_ends[index] - begin};
+}
+
+Engine::Engine(int threads)
+    : kernels_(best_kernels()), threads_(threads), pool_(ThreadPool::of_process()), scratch_(threads) {
+  pool_.reserve(threads);
 }
 
 std::shared_ptr<View> Engine::borrow_view() {
@@ -100,16 +224,38 @@ std::shared_ptr<View> Engine::borrow_view() {
   });
 }
 
+// Calls task(block) for every block.
+template <typename Task>
+void Engine::for_blocks(const View& view, const Task& task) {
+  constexpr std::size_t kMostPieces = 256;  // taking one costs more than skipping a block that is out of view
+  const std::size_t pieces = std::min(view.num_blocks, kMostPieces);
+  pool_.run(threads_, pieces, [&](std::size_t piece, int) {
+    const std::size_t end = view.num_blocks * (piece + 1) / pieces;
+    for (std::size_t block = view.num_blocks * piece / pieces; block < end; ++block) task(block);
+  });
+}
+
+// Calls task(row, scratch) for every row of tiles, the longest first.
+template <typename Task>
+void Engine::for_rows(const View& view, const Task& task) {
+  pool_.run(threads_, std::size_t(view.tiles_y),
+            [&](std::size_t piece, int worker) { task(view.longest_first[piece], scratch_[worker]); });
+}
+
 std::shared_ptr<View> Engine::forward(const GaussianArrays& gaussians, std::size_t count, const float* bounds,
                                       const Camera& camera, const Pose& pose, const Images& images) {
   std::lock_guard<std::mutex> lock(mutex_);
-  auto view = list(gaussians, count, bounds, camera, pose);
-  blend(*view, images);
+  auto view = project(gaussians, count, bounds, camera, pose);
+  for_rows(*view, [&](int row, Scratch& scratch) {
+    list_tiles(*view, row, scratch.keys, scratch.sorted);
+    for_tiles(*view, row,
+              [&](const TileList& tile, const Splat* members) { kernels_.forward(tile, members, camera, images); });
+  });
   return view;
 }
 
-std::shared_ptr<View> Engine::list(const GaussianArrays& gaussians, std::size_t count, const float* bounds,
-                                   const Camera& camera, const Pose& pose) {
+std::shared_ptr<View> Engine::project(const GaussianArrays& gaussians, std::size_t count, const float* bounds,
+                                      const Camera& camera, const Pose& pose) {
   check_size(camera.width, camera.height);
   if (count > std::numeric_limits<std::uint32_t>::max())
     throw TooLarge(std::to_string(count) + " Gaussians cannot be drawn: expected less than 2^32");
@@ -117,110 +263,36 @@ std::shared_ptr<View> Engine::list(const GaussianArrays& gaussians, std::size_t 
   view->camera = camera;
   view->pose = pose;
   view->num_gaussians = count;
+  view->num_blocks = blocks_of(count);
   view->tiles_x = (camera.width + kTile - 1) / kTile;
   view->tiles_y = (camera.height + kTile - 1) / kTile;
-  project(*view, gaussians, bounds);
-  sort_by_depth(*view);
-  list_tiles(*view);
+  grow(view->splats, count);
+  grow(view->rects, count);
+  grow(view->ids, count);
+  grow(view->block_sizes, view->num_blocks);
+  grow(view->places, view->num_blocks * view->tiles_y);
+  grow(view->widths, view->num_blocks * view->tiles_y);
+  for_blocks(*view, [&](std::size_t block) { project_block(*view, block, gaussians, bounds); });
+  divide_into_rows(*view);
+  for_blocks(*view, [&](std::size_t block) { copy_members(*view, block); });
   return view;
 }
 
-void Engine::project(View& view, const GaussianArrays& gaussians, const float* bounds) {
-  const std::size_t count = view.num_gaussians, blocks = blocks_of(count);
-  view.splats.resize(count);
-  view.rects.resize(count);
-  view.ids.resize(count);
-  view.block_sizes.resize(blocks);
-  std::atomic<std::size_t> next{0};
-  pool_.run([&](int) {
-    for (std::size_t block; (block = next.fetch_add(1)) < blocks;)
-      view.block_sizes[block] = bounds && !may_be_seen(bounds + kBounds * block, view.camera, view.pose)
-                                    ? 0
-                                    : kernels_.project(gaussians, view.camera, view.pose, block * kBlock,
-                                                       std::min(count, (block + 1) * kBlock), view.splats.data(),
-                                                       view.rects.data(), view.ids.data());
-  });
-}
-
-// Stable radix sort, lowest digit first: Gaussians of equal depth keep the order of the map.
-void Engine::sort_by_depth(View& view) {
-  std::vector<std::size_t> begins(view.block_sizes.size() + 1, 0);
-  for (std::size_t block = 0; block < view.block_sizes.size(); ++block)
-    begins[block + 1] = begins[block] + view.block_sizes[block];
-  const std::size_t visible = begins.back();
-  view.order.resize(visible);
-  view.scratch.resize(visible);
-  const int parts = pool_.size();
-  pool_.run([&](int thread) {
-    const std::size_t last = part(view.block_sizes.size(), thread + 1, parts);
-    for (std::size_t block = part(view.block_sizes.size(), thread, parts); block < last; ++block)
-      for (std::size_t i = 0; i < view.block_sizes[block]; ++i) {
-        const std::size_t splat = block * kBlock + i;
-        view.order[begins[block] + i] = std::uint64_t(depth_bits(view.splats[splat].z)) << 32 | splat;
-      }
-  });
-  std::vector<std::array<std::size_t, kDigits>> places(parts);
-  for (int shift = 32; shift < 32 + 3 * kDigitBits; shift += kDigitBits) {
-    const auto digit = [shift](std::uint64_t key) { return key >> shift & (kDigits - 1); };
-    pool_.run([&](int thread) {
-      places[thread].fill(0);
-      const std::size_t last = part(visible, thread + 1, parts);
-      for (std::size_t i = part(visible, thread, parts); i < last; ++i) ++places[thread][digit(view.order[i])];
+void Engine::project_block(View& view, std::size_t block, const GaussianArrays& gaussians, const float* bounds) {
+  view.block_sizes[block] = 0;
+  if (bounds && !may_be_seen(bounds + kBounds * block, view.camera, view.pose)) return;
+  const std::size_t begin = block * kBlock, end = std::min(view.num_gaussians, begin + kBlock);
+  view.block_sizes[block] = kernels_.project(gaussians, view.camera, view.pose, begin, end, view.splats.data(),
+                                             view.rects.data(), view.ids.data());
+  std::uint32_t *members = view.places.data() + view.tiles_y * block,
+                *widths = view.widths.data() + view.tiles_y * block;
+  std::fill_n(members, view.tiles_y, 0);
+  std::fill_n(widths, view.tiles_y, 0);
+  for (std::size_t splat = begin; splat < begin + view.block_sizes[block]; ++splat)
+    visit_rows(view.rects[splat], [=](int row, Columns columns) {
+      ++members[row];
+      widths[row] += std::uint32_t(columns.last + 1 - columns.first);
     });
-    std::size_t place = 0;
-    for (std::size_t value = 0; value < kDigits; ++value)
-      for (int thread = 0; thread < parts; ++thread) place += std::exchange(places[thread][value], place);
-    pool_.run([&](int thread) {
-      const std::size_t last = part(visible, thread + 1, parts);
-      for (std::size_t i = part(visible, thread, parts); i < last; ++i)
-        view.scratch[places[thread][digit(view.order[i])]++] = view.order[i];
-    });
-    view.order.swap(view.scratch);
-  }
-}
-
-void Engine::list_tiles(View& view) {
-  const std::size_t tiles = std::size_t(view.tiles_x) * view.tiles_y, visible = view.order.size();
-  const int parts = pool_.size();
-  std::vector<std::uint32_t> places(tiles * parts, 0);  // [threads, tiles]: each thread lists its part of the order
-  view.sorted_rects.resize(visible);
-  pool_.run([&](int thread) {
-    std::uint32_t* counts = places.data() + tiles * thread;
-    const std::size_t last = part(visible, thread + 1, parts);
-    for (std::size_t i = part(visible, thread, parts); i < last; ++i) {
-      const TileRect rect = view.sorted_rects[i] = view.rects[std::uint32_t(view.order[i])];
-      visit_tiles(rect, view.tiles_x, [counts](int tile) { ++counts[tile]; });
-    }
-  });
-  std::size_t entries = 0;
-  for (const std::uint32_t count : places) entries += count;
-  check_entries(visible, entries, view.camera.width, view.camera.height);
-  view.tile_begins.resize(tiles + 1);
-  std::uint32_t place = 0;
-  for (std::size_t tile = 0; tile < tiles; ++tile) {
-    view.tile_begins[tile] = place;
-    for (int thread = 0; thread < parts; ++thread) place += std::exchange(places[tiles * thread + tile], place);
-  }
-  view.tile_begins[tiles] = place;
-  view.entries.resize(place);
-  pool_.run([&](int thread) {
-    std::uint32_t* next = places.data() + tiles * thread;
-    const std::size_t last = part(visible, thread + 1, parts);
-    for (std::size_t i = part(visible, thread, parts); i < last; ++i) {
-      const std::uint32_t splat = std::uint32_t(view.order[i]);
-      visit_tiles(view.sorted_rects[i], view.tiles_x,
-                  [&view, next, splat](int tile) { view.entries[next[tile]++] = splat; });
-    }
-  });
-}
-
-void Engine::blend(const View& view, const Images& images) {
-  const int tiles = view.tiles_x * view.tiles_y;
-  std::atomic<int> next{0};
-  pool_.run([&](int) {
-    for (int tile; (tile = next.fetch_add(1)) < tiles;)
-      kernels_.forward(view.tile(tile), view.splats.data(), view.camera, images);
-  });
 }
 
 namespace {
@@ -247,36 +319,27 @@ void project_backward(const View& view, std::size_t splat, const SplatGradient& 
   }
 }
 
-// Returns the gradients of one thread, set to zero where there are splats.
-SplatGradient* cleared_gradients(View& view, int thread) {
-  SplatGradient* mine = view.gradients.data() + view.num_gaussians * thread;
-  for (std::size_t block = 0; block < view.block_sizes.size(); ++block)
-    std::fill_n(mine + block * kBlock, view.block_sizes[block], SplatGradient{});
-  return mine;
+// Clears the gradients of a row's members and returns them.
+SplatGradient* cleared_gradients(View& view, int row) {
+  SplatGradient* gradients = view.gradients.data() + view.member_begins[row];
+  std::fill_n(gradients, view.num_members(row), SplatGradient{});
+  return gradients;
 }
 
-// Sums the gradients of all threads into those of the first.
-const SplatGradient& summed_gradient(View& view, std::size_t splat, int parts) {
-  SplatGradient& sum = view.gradients[splat];
-  for (int thread = 1; thread < parts; ++thread) {
-    const SplatGradient& g = view.gradients[view.num_gaussians * thread + splat];
-    sum.log_alpha += g.log_alpha, sum.dx += g.dx, sum.dy += g.dy, sum.squared += g.squared;
-    sum.r += g.r, sum.g += g.g, sum.b += g.b, sum.z += g.z;
-  }
-  return sum;
-}
+using BlockGradients = std::array<SplatGradient, kBlock>;
 
-// Divides the tiles into runs of about equal work. The division depends on the view alone, so that sums are repeatable.
-std::vector<int> balanced_runs(const View& view, int parts) {
-  std::vector<int> begins(parts + 1);
-  for (int index = 0; index <= parts; ++index) {
-    const std::size_t entry = part(view.entries.size(), index, parts);
-    begins[index] =
-        int(std::lower_bound(view.tile_begins.begin(), view.tile_begins.end() - 1, entry) - view.tile_begins.begin());
+// Sums the gradients of a block's splats over the rows.
+void sum_gradients(const View& view, std::size_t block, BlockGradients& sums) {
+  RowPlaces next(view, block);
+  for (std::size_t i = 0; i < view.block_sizes[block]; ++i) {
+    SplatGradient sum{};
+    visit_rows(view.rects[block * kBlock + i], [&](int row, Columns) {
+      const SplatGradient& g = view.gradients[next.take(row)];
+      sum.log_alpha += g.log_alpha, sum.dx += g.dx, sum.dy += g.dy, sum.squared += g.squared;
+      sum.r += g.r, sum.g += g.g, sum.b += g.b, sum.z += g.z;
+    });
+    sums[i] = sum;
   }
-  begins[0] = 0;
-  begins[parts] = view.tiles_x * view.tiles_y;
-  return begins;
 }
 
 }  // namespace
@@ -284,26 +347,20 @@ std::vector<int> balanced_runs(const View& view, int parts) {
 void Engine::backward(View& view, const GaussianArrays& gaussians, const ConstImages& drawn,
                       const ConstImages& gradient, const MapGradients& map, float pose_gradient[12]) {
   std::lock_guard<std::mutex> lock(mutex_);
-  const int parts = pool_.size();
-  const std::size_t count = view.num_gaussians, blocks = view.block_sizes.size();
-  const auto runs = balanced_runs(view, parts);
   const bool any_map = map.means || map.log_scales || map.logit_opacities || map.rgb;
-  view.gradients.resize(count * parts);
-  pool_.run([&](int thread) {
-    SplatGradient* mine = cleared_gradients(view, thread);
-    for (int tile = runs[thread]; tile < runs[thread + 1]; ++tile)
-      kernels_.backward(view.tile(tile), view.splats.data(), view.camera, drawn, gradient, any_map, mine);
+  grow(view.gradients, view.member_begins.back());
+  for_rows(view, [&](int row, Scratch&) {
+    SplatGradient* gradients = cleared_gradients(view, row);
+    for_tiles(view, row, [&](const TileList& tile, const Splat* members) {
+      kernels_.backward(tile, members, view.camera, drawn, gradient, any_map, gradients);
+    });
   });
-  std::vector<std::array<double, 12>> pose_sums(blocks);
-  std::atomic<std::size_t> next{0};
-  pool_.run([&](int) {
-    for (std::size_t block; (block = next.fetch_add(1)) < blocks;) {
-      pose_sums[block].fill(0.0);
-      for (std::size_t splat = block * kBlock; splat < block * kBlock + view.block_sizes[block]; ++splat) {
-        const SplatGradient& sum = summed_gradient(view, splat, parts);
-        project_backward(view, splat, sum, gaussians, map, pose_sums[block].data());
-      }
-    }
+  std::vector<std::array<double, 12>> pose_sums(view.num_blocks);
+  for_blocks(view, [&](std::size_t block) {
+    BlockGradients sums;
+    sum_gradients(view, block, sums);
+    for (std::size_t i = 0; i < view.block_sizes[block]; ++i)
+      project_backward(view, block * kBlock + i, sums[i], gaussians, map, pose_sums[block].data());
   });
   for (int entry = 0; entry < 12; ++entry) {
     double sum = 0.0;
@@ -312,42 +369,40 @@ void Engine::backward(View& view, const GaussianArrays& gaussians, const ConstIm
   }
 }
 
-float* Engine::footprints(int thread, std::size_t count) {
+float* Engine::Scratch::for_footprints(std::size_t count) {
   constexpr std::size_t kVector = 8;  // floats; the kernels need aligned vectors
-  auto& scratch = footprints_[thread];
-  if (scratch.size() < count * kFloatsPerFootprint + kVector) scratch.resize(2 * count * kFloatsPerFootprint + kVector);
-  const auto address = reinterpret_cast<std::uintptr_t>(scratch.data()) / sizeof(float);
-  return scratch.data() + (kVector - address % kVector) % kVector;
+  const std::size_t size = count * kFloatsPerFootprint + kVector;
+  if (footprints.size() < size) footprints.resize(2 * size);
+  const auto address = reinterpret_cast<std::uintptr_t>(footprints.data()) / sizeof(float);
+  return footprints.data() + (kVector - address % kVector) % kVector;
 }
 
 double Engine::fit(const MutableGaussians& gaussians, std::size_t count, float* bounds, const AdamState& adam,
                    const AdamRates& rates, const Camera& camera, const Pose& pose, const Target& target) {
   std::lock_guard<std::mutex> lock(mutex_);
   const GaussianArrays now{gaussians.means, gaussians.log_scales, gaussians.logit_opacities, gaussians.rgb};
-  auto view = list(now, count, bounds, camera, pose);
-  const int parts = pool_.size();
-  const auto runs = balanced_runs(*view, parts);
-  std::vector<double> losses(parts, 0.0);
-  footprints_.resize(parts);
-  view->gradients.resize(count * parts);
-  pool_.run([&](int thread) {
-    SplatGradient* mine = cleared_gradients(*view, thread);
-    for (int tile = runs[thread]; tile < runs[thread + 1]; ++tile) {
-      const TileList list = view->tile(tile);
-      losses[thread] += kernels_.fit(list, view->splats.data(), camera, target, footprints(thread, list.count), mine);
-    }
+  auto view = project(now, count, bounds, camera, pose);
+  grow(view->gradients, view->member_begins.back());
+  std::vector<double> losses(view->tiles_y, 0.0);
+  for_rows(*view, [&](int row, Scratch& scratch) {
+    list_tiles(*view, row, scratch.keys, scratch.sorted);
+    SplatGradient* gradients = cleared_gradients(*view, row);
+    double loss = 0.0;
+    for_tiles(*view, row, [&](const TileList& tile, const Splat* members) {
+      loss += kernels_.fit(tile, members, camera, target, scratch.for_footprints(tile.count), gradients);
+    });
+    losses[row] = loss;
   });
-  std::atomic<std::size_t> next{0};
-  pool_.run([&](int) {
-    for (std::size_t block; (block = next.fetch_add(1)) < view->block_sizes.size();) {
-      const std::size_t begin = block * kBlock, end = begin + view->block_sizes[block];
-      for (std::size_t splat = begin; splat < end; ++splat) summed_gradient(*view, splat, parts);
-      kernels_.update(view->splats.data(), view->ids.data(), view->gradients.data(), begin, end, camera, pose,
-                      gaussians, adam, rates, bounds ? bounds + kBounds * block : nullptr);
-    }
+  for_blocks(*view, [&](std::size_t block) {
+    if (view->block_sizes[block] == 0) return;
+    BlockGradients sums;
+    sum_gradients(*view, block, sums);
+    kernels_.update(view->splats.data() + block * kBlock, view->ids.data() + block * kBlock, sums.data(), 0,
+                    view->block_sizes[block], camera, pose, gaussians, adam, rates,
+                    bounds ? bounds + kBounds * block : nullptr);
   });
   double loss = 0.0;
-  for (double part : losses) loss += part;
+  for (const double of_row : losses) loss += of_row;
   return loss;
 }
 

@@ -25,31 +25,51 @@ void check_size(int width, int height);
 // Throws TooLarge if the tiles of an image have more than kMaxEntries entries.
 void check_entries(std::size_t count, std::size_t entries, int width, int height);
 
-// What a forward pass stores for its backward pass. Projected Gaussians are stored in blocks of kBlock, with gaps.
+// A Gaussian's columns of tiles in one row of tiles: first..last, none if first > last.
+struct Columns {
+  std::uint16_t first, last;
+};
+
+// What a forward pass stores for its backward pass. Projected Gaussians (splats) are stored in blocks of kBlock, with
+// gaps. Each row of tiles has copies (members) of the splats that touch it, in the order of the map, and its own sums
+// of their gradients, which are then added row by row. So neither sums nor memory depend on the number of threads.
+// Vectors are as long as the largest view needed, so that they are not cleared again and again.
 struct View {
   Camera camera;
   Pose pose;
-  std::size_t num_gaussians = 0;
-  std::vector<Splat> splats;
-  std::vector<TileRect> rects, sorted_rects;  // the latter by depth
-  std::vector<std::uint32_t> ids;             // splat -> Gaussian
-  std::vector<std::size_t> block_sizes;       // visible Gaussians per block
-  std::vector<std::uint64_t> order, scratch;  // depth bits << 32 | splat
-  std::vector<std::uint32_t> entries;         // splats, tile by tile, front to back
-  std::vector<std::size_t> tile_begins;       // tiles + 1
-  std::vector<SplatGradient> gradients;       // one block of num_gaussians per thread
+  std::size_t num_gaussians = 0, num_blocks = 0;
   int tiles_x = 0, tiles_y = 0;
 
+  std::vector<Splat> splats;
+  std::vector<TileRect> rects;
+  std::vector<std::uint32_t> ids;        // splat -> Gaussian
+  std::vector<std::size_t> block_sizes;  // visible Gaussians per block
+  std::vector<std::uint32_t> places;     // [blocks, rows]: where a block's splats begin among a row's members
+  std::vector<std::uint32_t> widths;     // [blocks, rows]: entries of a block's splats in the lists of a row's tiles
+
+  std::vector<std::size_t> member_begins;  // rows + 1
+  std::vector<Splat> members;              // row by row
+  std::vector<Columns> columns;            // of the members
+  std::vector<SplatGradient> gradients;    // of the members
+
+  std::vector<std::size_t> entry_begins;            // rows + 1
+  std::vector<std::size_t> tile_begins, tile_ends;  // of a tile's entries
+  std::vector<std::uint32_t> entries;  // members, counted from the row's first, tile by tile, front to back
+  std::vector<int> longest_first;      // rows, by entries
+
   TileList tile(int index) const;
+  std::size_t num_members(int row) const { return member_begins[row + 1] - member_begins[row]; }
 };
 
 struct MapGradients {  // null where a gradient is not wanted
   float *means, *log_scales, *logit_opacities, *rgb;
 };
 
+// Its results do not depend on the number of threads, bit for bit. Calls may come from several threads; one that
+// finds the engine at work waits.
 class Engine : public std::enable_shared_from_this<Engine> {
  public:
-  explicit Engine(int threads) : kernels_(best_kernels()), pool_(threads) {}
+  explicit Engine(int threads);
 
   // bounds: [blocks, kBounds], by which blocks out of view are skipped; may be null.
   std::shared_ptr<View> forward(const GaussianArrays&, std::size_t count, const float* bounds, const Camera&,
@@ -67,19 +87,30 @@ class Engine : public std::enable_shared_from_this<Engine> {
   const char* instruction_set() const { return kernels_.name; }
 
  private:
+  // Memory of one thread, reused.
+  struct Scratch {
+    std::vector<std::uint64_t> keys, sorted;  // depth bits << 32 | member
+    std::vector<float> footprints;            // of Kernels::fit
+
+    float* for_footprints(std::size_t count);
+  };
+
   std::shared_ptr<View> borrow_view();
-  std::shared_ptr<View> list(const GaussianArrays&, std::size_t count, const float* bounds, const Camera&, const Pose&);
-  void project(View&, const GaussianArrays&, const float* bounds);
-  float* footprints(int thread, std::size_t count);  // scratch of Kernels::fit
-  void sort_by_depth(View&);
-  void list_tiles(View&);
-  void blend(const View&, const Images&);
+  std::shared_ptr<View> project(const GaussianArrays&, std::size_t count, const float* bounds, const Camera&,
+                                const Pose&);
+  void project_block(View&, std::size_t block, const GaussianArrays&, const float* bounds);
+
+  template <typename Task>
+  void for_blocks(const View&, const Task& task);
+  template <typename Task>
+  void for_rows(const View&, const Task& task);
 
   const Kernels& kernels_;
-  ThreadPool pool_;
+  const int threads_;
+  ThreadPool& pool_;
   std::mutex mutex_, spare_mutex_;
-  std::vector<std::vector<float>> footprints_;  // per thread
-  std::vector<std::unique_ptr<View>> spare_;    // reused: page faults of new memory cost more than the work
+  std::vector<Scratch> scratch_;              // per worker of the pool
+  std::vector<std::unique_ptr<View>> spare_;  // reused: page faults of new memory cost more than the work
 };
 
 }  // namespace splatam

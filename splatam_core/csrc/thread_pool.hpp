@@ -1,15 +1,20 @@
-// A pool of threads: run(task) calls task(0..size-1), one index per thread, and returns when all are done. A render is
-// a dozen such tasks, each shorter than waking a thread takes. So a thread polls for the next task for 100 us before it
-// sleeps. What a task throws ends that index alone; run() rethrows the first of them when all are done.
+// The threads of the native code: one pool for everything in the process. run(threads, pieces, task) calls
+// task(piece, worker) once for each piece, on up to `threads` threads: the caller, which is worker 0, and the pool's.
+//
+// Pieces are taken from a shared counter, and the caller takes them, too. So a thread that the scheduler has put aside
+// delays nobody, unless it holds a piece: keep pieces short. A second caller finds the pool taken and does its pieces
+// alone. Results must not depend on which thread does a piece, nor on how many there are.
 #pragma once
 
+#include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
 #include <cstdint>
 #include <exception>
-#include <functional>
+#include <memory>
 #include <mutex>
+#include <stdexcept>
 #include <thread>
 #include <utility>
 #include <vector>
@@ -18,92 +23,170 @@ namespace splatam {
 
 class ThreadPool {
  public:
-  explicit ThreadPool(int size) : size_(size) {
-    try {
-      for (int index = 1; index < size; ++index) threads_.emplace_back([this, index] { work(index); });
-    } catch (...) {  // the system has no more threads: those that run would end the process if they were not joined
-      stop();
-      throw;
-    }
+  // It is never destroyed: at the end of the process its threads may still be asleep in it.
+  static ThreadPool& of_process() {
+    static ThreadPool* const pool = new ThreadPool;
+    return *pool;
   }
-
-  ~ThreadPool() { stop(); }
 
   ThreadPool(const ThreadPool&) = delete;
   ThreadPool& operator=(const ThreadPool&) = delete;
 
-  int size() const { return size_; }
-
-  void run(const std::function<void(int)>& task) {
-    if (size_ == 1) return task(0);
-    {
-      std::lock_guard<std::mutex> lock(mutex_);
-      task_ = &task;
-      failure_ = nullptr;
-      running_.store(size_ - 1, std::memory_order_relaxed);
-      generation_.fetch_add(1, std::memory_order_release);
+  // Starts threads until `threads` can work at once, the caller included. Throws std::system_error if the system has no
+  // more.
+  void reserve(int threads) {
+    std::lock_guard<std::mutex> lock(mutex_);
+    while (int(workers_.size()) < threads - 1) {
+      auto worker = std::make_unique<Worker>();
+      worker->index = int(workers_.size()) + 1;
+      workers_.reserve(workers_.size() + 1);
+      std::thread([this, self = worker.get()] { work(*self); }).detach();
+      workers_.push_back(std::move(worker));
     }
-    wake_.notify_all();
-    attempt(task, 0);
-    // The other threads finish within microseconds of this one, so yielding beats sleeping. They use the task, so they
-    // are waited for also when it failed here.
-    while (running_.load(std::memory_order_acquire) != 0) std::this_thread::yield();
-    if (failure_) std::rethrow_exception(std::exchange(failure_, nullptr));
+  }
+
+  // Returns when all pieces are done. What a task throws ends its piece; the pieces that nobody has begun are left out,
+  // and the first exception is thrown again here.
+  template <typename Task>
+  void run(int threads, std::size_t pieces, const Task& task) {
+    if (pieces > kMostPieces) throw std::length_error("too many pieces of work");
+    std::unique_lock<std::mutex> turn(turn_, std::defer_lock);
+    if (threads == 1 || pieces < 2 || !turn.try_lock()) {
+      for (std::size_t piece = 0; piece < pieces; ++piece) task(piece, 0);
+      return;
+    }
+    const Job job{[](const void* of, std::size_t piece, int worker) { (*static_cast<const Task*>(of))(piece, worker); },
+                  &task, pieces};
+    share(job, std::min<std::size_t>(threads, pieces));
   }
 
  private:
-  void attempt(const std::function<void(int)>& task, int index) noexcept {
-    try {
-      task(index);
-    } catch (...) {
-      std::lock_guard<std::mutex> lock(mutex_);
-      if (!failure_) failure_ = std::current_exception();
-    }
-  }
+  using Clock = std::chrono::steady_clock;
+  using Ticks = Clock::duration;
+  static constexpr std::size_t kMostPieces = 0xffffffff;
+  static constexpr Ticks kShortestWait = std::chrono::microseconds(2), kLongestWait = std::chrono::microseconds(50);
 
-  void stop() {
+  struct Job {
+    void (*call)(const void* task, std::size_t piece, int worker);
+    const void* task;
+    std::size_t pieces;
+  };
+
+  struct Worker {
+    int index;
+    bool asleep = false;  // under mutex_
+    std::condition_variable wake;
+  };
+
+  ThreadPool() = default;
+  ~ThreadPool() = default;
+
+  void share(const Job& job, std::size_t threads) {
+    job_ = job;
+    failure_ = nullptr;
+    failed_.store(false, std::memory_order_relaxed);
+    unfinished_.store(job.pieces, std::memory_order_relaxed);
+    limit_.store(int(threads), std::memory_order_relaxed);
+    const std::uint64_t generation = (tickets_.load(std::memory_order_relaxed) >> 32) + 1;
+    tickets_.store(generation << 32 | job.pieces, std::memory_order_release);
     {
       std::lock_guard<std::mutex> lock(mutex_);
-      stopping_ = true;
-      ++generation_;
+      for (std::size_t i = 0; i < std::min(workers_.size(), threads - 1); ++i)
+        if (workers_[i]->asleep) workers_[i]->wake.notify_one();
     }
-    wake_.notify_all();
-    for (auto& thread : threads_) thread.join();
+    const auto begin = Clock::now();
+    std::size_t mine = 0;
+    while (do_piece(0)) ++mine;
+    // Another thread needs about as long for its piece as this one did for each of its own. One that takes longer has
+    // been put aside, maybe for this thread, which then does better to sleep: it is woken before those that do not.
+    const Ticks usual = (Clock::now() - begin) / Ticks::rep(std::max<std::size_t>(mine, 1));
+    const auto is_done = [this] { return unfinished_.load(std::memory_order_acquire) == 0; };
+    if (!spin(2 * usual + kShortestWait, is_done)) {
+      std::unique_lock<std::mutex> lock(mutex_);
+      finished_.wait(lock, is_done);
+    }
+    if (failure_) std::rethrow_exception(std::exchange(failure_, nullptr));
   }
 
-  void work(int index) {
-    std::uint64_t seen = 0;
-    for (;;) {
-      const std::function<void(int)>* task;
-      poll(seen);
-      {
-        std::unique_lock<std::mutex> lock(mutex_);
-        wake_.wait(lock, [&] { return generation_ != seen; });
-        seen = generation_;
-        if (stopping_) return;
-        task = task_;
+  // Takes a piece and does it. Returns false if none is left, or none for this worker. tickets_ holds the number of the
+  // job and, below, how many pieces are left to take. Who has taken one may read job_: it stays until all are done.
+  bool do_piece(int worker) {
+    std::uint64_t tickets = tickets_.load(std::memory_order_acquire);
+    do {
+      if (std::uint32_t(tickets) == 0 || worker >= limit_.load(std::memory_order_relaxed)) return false;
+    } while (!tickets_.compare_exchange_weak(tickets, tickets - 1, std::memory_order_acq_rel));
+    const std::size_t piece = job_.pieces - std::uint32_t(tickets);
+    if (!failed_.load(std::memory_order_relaxed)) {
+      try {
+        job_.call(job_.task, piece, worker);
+      } catch (...) {
+        std::lock_guard<std::mutex> lock(mutex_);
+        if (!failed_.exchange(true)) failure_ = std::current_exception();
       }
-      attempt(*task, index);
-      running_.fetch_sub(1, std::memory_order_release);
+    }
+    if (unfinished_.fetch_sub(1, std::memory_order_acq_rel) == 1 && worker != 0) {
+      std::lock_guard<std::mutex> lock(mutex_);
+      finished_.notify_one();
+    }
+    return true;
+  }
+
+  bool is_work_for(int worker) const {
+    return std::uint32_t(tickets_.load(std::memory_order_acquire)) != 0 &&
+           worker < limit_.load(std::memory_order_relaxed);
+  }
+
+  void work(Worker& self) {
+    const auto is_work = [&] { return is_work_for(self.index); };
+    Ticks wait = kLongestWait;
+    for (;;) {
+      while (do_piece(self.index)) {
+      }
+      // The stages of a render follow one another faster than a thread can be woken. Where it did not pay to wait for
+      // the next one, the wait is shorter the next time.
+      if (spin(wait, is_work)) {
+        wait = std::min(2 * wait, kLongestWait);
+        continue;
+      }
+      wait = std::max(wait / 2, kShortestWait);
+      std::unique_lock<std::mutex> lock(mutex_);
+      self.asleep = true;
+      self.wake.wait(lock, is_work);
+      self.asleep = false;
     }
   }
 
-  // Polls for up to 100 us until there is a new task.
-  void poll(std::uint64_t seen) const {
-    const auto end = std::chrono::steady_clock::now() + std::chrono::microseconds(100);
-    while (generation_.load(std::memory_order_acquire) == seen && std::chrono::steady_clock::now() < end)
-      std::this_thread::yield();
+  // Waits without giving up the core. Returns whether the condition holds in time.
+  template <typename Condition>
+  static bool spin(Ticks limit, const Condition& holds) {
+    const auto end = Clock::now() + limit;
+    do {
+      for (int i = 0; i < 16; ++i) {
+        if (holds()) return true;
+        relax();
+      }
+    } while (Clock::now() < end);
+    return false;
   }
 
-  const int size_;
-  std::vector<std::thread> threads_;
+  static void relax() {
+#if defined(__x86_64__)
+    __builtin_ia32_pause();
+#elif defined(__aarch64__)
+    asm volatile("yield");
+#endif
+  }
+
+  std::mutex turn_;  // held by the caller whose job the pool does
   std::mutex mutex_;
-  std::condition_variable wake_;
-  const std::function<void(int)>* task_ = nullptr;
+  std::vector<std::unique_ptr<Worker>> workers_;
+  std::condition_variable finished_;
+  Job job_{};
   std::exception_ptr failure_;
-  std::atomic<std::uint64_t> generation_{0};
-  std::atomic<int> running_{0};
-  bool stopping_ = false;
+  std::atomic<bool> failed_{false};
+  std::atomic<int> limit_{0};
+  std::atomic<std::uint64_t> tickets_{0};
+  std::atomic<std::size_t> unfinished_{0};
 };
 
 }  // namespace splatam

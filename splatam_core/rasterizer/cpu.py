@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 class CpuRasterizer:
     """Sorted, tiled, vectorised and threaded.
 
-    With a fixed number of threads results are repeatable bit for bit; images do not depend on the number.
+    Results are repeatable bit for bit and do not depend on the number of threads. It may be used by several threads at once.
     """
 
     def __init__(self, threads: int = 0) -> None:
