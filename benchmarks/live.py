@@ -53,15 +53,20 @@ class Child:
         if (code := self._process.wait(STOP_TIMEOUT_S)) != exit_code:
             sys.exit(f'{self._command} ended with exit code {code}; its output:\n{self.log.read_text()}')
 
-    def stop(self) -> None:
-        """Send SIGINT and wait."""
+    def stop(self) -> int:
+        """Send SIGINT and wait. Returns the exit code."""
         if self.is_running:
             self._process.send_signal(signal.SIGINT)
             try:
                 self._process.wait(STOP_TIMEOUT_S)
             except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+                self.kill()
+        return self._process.wait()
+
+    def kill(self) -> None:
+        """Send SIGKILL and wait."""
+        self._process.kill()
+        self._process.wait()
 
     def cpu_s(self) -> float:
         """Returns the CPU time of all its threads so far, in seconds."""

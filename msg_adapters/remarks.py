@@ -8,6 +8,9 @@ from msg_adapters.camera_info import has_only_p
 from msg_adapters.encodings import ORDERED
 
 LARGE_GAP_NS = 20_000_000  # rtabmap_ros warns from the same gap
+NOT_STAMPED = (
+    'the driver does not stamp; use_receive_time takes the time of receiving instead (offline: --use-receive-time, of recording)'
+)
 
 
 def on_info(message: Any) -> str:

@@ -6,7 +6,7 @@ import errno
 import os
 import shutil
 import stat
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
@@ -78,3 +78,36 @@ def replace_text(path: Path, text: str) -> None:
     """Writes a text file in one step; it replaces the file at the path."""
     with replaced(path) as temporary:
         temporary.write_text(text, encoding='utf-8')
+
+
+@contextmanager
+def prepared(texts: Mapping[Path, str]) -> Iterator[Callable[[], None]]:
+    """Writes text files under temporary names. Yields a function that puts all of them in place, which takes no space.
+
+    Raises:
+        OSError: they do not fit on the disk; nothing has changed.
+    """
+    temporary = {path: path.with_name(f'.{path.name}.{os.getpid()}') for path in texts}
+    try:
+        for path, text in texts.items():
+            with temporary[path].open('w', encoding='utf-8') as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+
+        def put_in_place() -> None:
+            for path in texts:
+                os.replace(temporary[path], path)
+
+        yield put_in_place
+    finally:
+        for path in temporary.values():
+            path.unlink(missing_ok=True)
+
+
+def same_file(path: Path, other: Path) -> None:
+    """Gives a file a second name, without taking space for it; where the file system cannot, makes a copy."""
+    try:
+        os.link(path, other)
+    except OSError:
+        shutil.copy2(path, other)

@@ -23,6 +23,7 @@ from splatam_core.text_files import parse_yaml, read_yaml
 
 MAX_STEPS, MAX_SAMPLES, MAX_FRAMES = 100_000, 1_000_000, 10**9
 MAX_PX = 65_536
+MAX_GAUSSIANS = 10**9
 MAX_SEED = 2**63 - 1
 DEVICES = ('auto', 'cpu', 'cuda')
 WHERE = frozenset({'device', 'rasterizer', 'threads', 'keyframes.on_device'})
@@ -273,6 +274,12 @@ class MappingConfig:
         'renders, compares (Huber loss, no SSIM) and moves the visible Gaussians.',
         choices=('paper', 'fused'),
     )
+    max_gaussians: int = setting(
+        0,
+        'Largest number of Gaussians; beyond it, a tenth of them is dropped, those farthest from the camera. 0 = no limit; set it '
+        'for runs of hours in new places. Each takes about 0.1 kB; increase when there is memory to spare.',
+        minimum=0, maximum=MAX_GAUSSIANS,
+    )  # fmt: skip
     color_weight: float = setting(0.5, 'Weight of the colour loss.', minimum=0.0)
     depth_weight: float = setting(1.0, 'Weight of the depth loss. Decrease when depth is noisy.', minimum=0.0)
     means_rate: float = setting(1e-4, 'Adam step size of the centres.', unit='m', minimum=0.0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,13 +17,14 @@ from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.images.observation import Observation
 from splatam_core.images.spacing import describe_spacing
+from splatam_core.interruption import Stop, never
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.mapper import Mapper
-from splatam_core.mapping.optimizers.base import TimeLimit, never
+from splatam_core.mapping.optimizers.base import TimeLimit
 from splatam_core.rasterizer import Gaussians, make_rasterizer
 from splatam_core.state import SlamState
 from splatam_core.stopwatch import Stopwatch
-from splatam_core.tracking import TrackingResult, make_tracker
+from splatam_core.tracking import Tracker, TrackingResult, make_tracker
 from splatam_core.tracking.motion import MotionModel, MotionPrior
 from splatam_core.types import FrameResult, MapSnapshot, RenderedView, RgbdFrame, Status
 
@@ -77,7 +77,7 @@ class SlamLifecycle:
 
     def __init__(
         self, config: SlamConfig, motion_prior: MotionPrior | None = None, *,
-        true_motion: MotionPrior | None = None, num_frames: int | None = None,
+        true_motion: MotionPrior | None = None, num_frames: int | None = None, stop: Stop = never,
     ) -> None:  # fmt: skip
         """Begins with an empty map.
 
@@ -86,6 +86,8 @@ class SlamLifecycle:
             motion_prior: the camera's motion as another sensor measured it.
             true_motion: the camera's true motion, for ``tracking.method: truth``; known for every frame.
             num_frames: number of frames of the recording; None where that is unknown.
+            stop: asked before each step of a frame. Once it returns True, tracking gives the frame up with a FrameError, and
+                mapping takes no further step.
 
         Raises:
             ConfigError: the configuration asks for ground truth, a device or a rasterizer that is not there.
@@ -94,8 +96,9 @@ class SlamLifecycle:
         self.config = config
         self.backend = choose_backend(config)
         self._motion_prior, self._true_motion, self._recording_length = motion_prior, true_motion, num_frames
+        self._stop = stop
         self._rasterizer = make_rasterizer(self.backend.rasterizer, config.threads)
-        self._tracker = make_tracker(self._rasterizer, config.tracking, config.threads, self.backend.device)
+        self._tracker = self._new_tracker()
         self._told_spacing = False
         self.reset()
 
@@ -126,7 +129,7 @@ class SlamLifecycle:
         check_truth(config, self._true_motion)
         self.config = config
         self._mapper.configure(config)
-        self._tracker = make_tracker(self._rasterizer, config.tracking, config.threads, self.backend.device)
+        self._tracker = self._new_tracker()
 
     def load(self, gaussians: Gaussians, T_world_cam: Matrix) -> None:
         """Continues in a map made earlier.
@@ -199,7 +202,7 @@ class SlamLifecycle:
         with torch.no_grad():
             return self._rasterizer.render(self.map.gaussians.detached(), self.camera, T_cam_world).images()
 
-    def finish(self, limit_s: float = math.inf, stop: Callable[[], bool] = never) -> int:
+    def finish(self, limit_s: float = math.inf, stop: Stop = never) -> int:
         """Fits the map to all keyframes once more, after the last frame (``mapping.fused.final_passes``).
 
         Args:
@@ -237,7 +240,10 @@ class SlamLifecycle:
         return seen
 
     def _new_mapper(self) -> Mapper:
-        return Mapper(self.config, self._rasterizer, self.backend.device, self._recording_length)
+        return Mapper(self.config, self._rasterizer, self.backend.device, self._recording_length, self._stop)
+
+    def _new_tracker(self) -> Tracker:
+        return make_tracker(self._rasterizer, self.config.tracking, self.config.threads, self.backend.device, self._stop)
 
     def _new_motion_model(self) -> MotionModel:
         if self.config.tracking.method == 'truth':

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+from splatam_core.interruption import never
 from splatam_core.types import FrameResult, RgbdFrame
 
 if TYPE_CHECKING:
@@ -17,11 +18,6 @@ if TYPE_CHECKING:
 T = TypeVar('T')
 WhenFull = Literal['drop_oldest', 'block']
 POLL_S = 0.1  # longest time until ``give_up`` is asked again
-
-
-def never() -> bool:
-    """Never gives up."""
-    return False
 
 
 class WorkerStopped(RuntimeError):

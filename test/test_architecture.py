@@ -43,7 +43,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ('splatam_core.geometry',),
     ('splatam_core.types',),
     ('splatam_core.device',),
-    ('splatam_core.stopwatch', 'splatam_core.images'),
+    ('splatam_core.stopwatch', 'splatam_core.interruption', 'splatam_core.images'),
     ('splatam_core.datasets',),
     ('splatam_core._native',),
     ('splatam_core.rasterizer',),

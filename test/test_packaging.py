@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+from configparser import ConfigParser
 from importlib import metadata
 from pathlib import Path
 from xml.etree import ElementTree
@@ -141,3 +142,10 @@ def test_ctrl_c_while_it_loads_is_no_traceback(program: str, monkeypatch: pytest
 
     monkeypatch.setattr(entry, 'import_module', interrupted)
     assert getattr(entry, program)() == 128 + signal.SIGINT
+
+
+def test_scripts_start_with_the_python_of_the_environment() -> None:
+    """colcon of apt builds with the system's Python, which does not see an active virtual environment."""
+    settings = ConfigParser()
+    settings.read(ROOT / 'setup.cfg')
+    assert settings['build_scripts']['executable'] == '/usr/bin/env python3'

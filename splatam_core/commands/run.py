@@ -163,7 +163,36 @@ def _resume(args: argparse.Namespace) -> _Job:
 
 def _checked_ground_truth(sequence: FrameSequence, args: argparse.Namespace) -> Trajectory | None:
     """Returns the true poses, read before the run begins, so that a fault in them is said before it and costs no time."""
-    return None if args.no_evaluate else usable_ground_truth(sequence)
+    truth = None if args.no_evaluate else usable_ground_truth(sequence)
+    if truth is None:
+        return None
+    stamps_ns = [stamp_ns for order in (1, -1) if (stamp_ns := _first_stamp_ns(sequence, order)) is not None]
+    begin_ns, end_ns = int(truth.stamps_ns[0]), int(truth.stamps_ns[-1])
+    if not stamps_ns or (begin_ns <= stamps_ns[-1] and stamps_ns[0] <= end_ns):
+        return truth
+    say(
+        f'the ground truth is not used: the frames span {_span(stamps_ns[0], stamps_ns[-1])}, the ground truth '
+        f'{_span(begin_ns, end_ns)}; are they of the same recording and clock?'
+    )
+    return None
+
+
+def _first_stamp_ns(sequence: FrameSequence, order: int) -> int | None:
+    """Returns the stamp of the first frame that can be read; None if none of ten can. order: 1, or -1 to begin at the end."""
+    for index in range(len(sequence))[::order][:10]:
+        try:
+            return sequence[index].stamp_ns
+        except FrameError:
+            continue
+        except SplatamError:  # processing stops there, and says so
+            return None
+    return None
+
+
+def _span(first_ns: int, last_ns: int) -> str:
+    from splatam_core.geometry.trajectory import stamp_text
+
+    return f'{stamp_text(first_ns)} to {stamp_text(last_ns)} s'
 
 
 def _say_backend(slam: Slam) -> None:

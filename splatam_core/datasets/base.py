@@ -244,3 +244,22 @@ def check_increasing(stamps_ns: NDArray[np.int64], name: str) -> None:
             f'{name}: time does not increase from frame {at - 1} ({int(stamps_ns[at - 1])} ns) to frame {at} '
             f'({int(stamps_ns[at])} ns); cut the recording there'
         )
+
+
+def nearest_depth(color_ns: NDArray[np.int64], depth_ns: NDArray[np.int64]) -> str:
+    """Returns how far depth is from colour and which option pairs them, as the end of an error message; empty without images.
+
+    Args:
+        color_ns: [N] stamps, in any order.
+        depth_ns: [M] stamps, in any order.
+    """
+    if not (color_ns.size and depth_ns.size):
+        return ''
+    color, depth = np.sort(color_ns), np.sort(depth_ns)
+    after = np.searchsorted(depth, color).clip(0, len(depth) - 1)
+    before = (after - 1).clip(0)
+    to_after, to_before = depth[after] - color, depth[before] - color
+    gap_s = float(np.median(np.where(np.abs(to_after) < np.abs(to_before), to_after, to_before))) / 1e9
+    needed_s = np.ceil(abs(gap_s) * 1e3 + 1) / 1e3
+    way_out = f'--max-interval {needed_s:g} pairs them' if needed_s <= MAX_INTERVAL_S else 'are their clocks the same?'
+    return f'; the nearest depth is {gap_s:+.3f} s from its colour (median): {way_out}'

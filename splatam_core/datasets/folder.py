@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from splatam_core.datasets import base, files
 from splatam_core.datasets.camera_file import CameraFile, find_camera_file
-from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
+from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory, with_missing
 from splatam_core.errors import DatasetError
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 from splatam_core.geometry.trajectory import Trajectory
@@ -60,8 +60,9 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
         DatasetError: there are no frames, too many lack their depth, or the camera is not stated.
         CameraError: the camera cannot be used.
     """
-    color = _by_number(folder / (_present(folder, COLOR_FOLDERS) or COLOR_FOLDERS[0]), ('.jpg', '.jpeg', '.png'))
     depth = _by_number(folder / 'depth', ('.png',))
+    colors = _by_number(folder / (_present(folder, COLOR_FOLDERS) or COLOR_FOLDERS[0]), ('.jpg', '.jpeg', '.png'))
+    color = with_missing(colors, depth)
     numbers = list(color)
     pairs = pair_up(
         {position: color[number] for position, number in enumerate(numbers)},

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from splatam_core.datasets import base, files
 from splatam_core.datasets.camera_file import camera_of, say_assumed
-from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
+from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory, with_missing
 from splatam_core.errors import DatasetError
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
@@ -47,8 +47,9 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
         DatasetError: there are no frames, or too many lack their depth.
         CameraError: ``camera.yaml`` cannot be used.
     """
-    color = files.numbered(folder / 'rgb', r'(\d+)\.png')
-    pairs = pair_up(color, files.numbered(folder / 'depth', r'(\d+)\.png'), folder, 'rgb/0.png with depth/0.png')
+    depth = files.numbered(folder / 'depth', r'(\d+)\.png')
+    color = with_missing(files.numbered(folder / 'rgb', r'(\d+)\.png'), depth)
+    pairs = pair_up(color, depth, folder, 'rgb/0.png with depth/0.png')
     camera = camera_of(folder, lambda: _assumed(folder), DEPTH_SCALE)
 
     def ground_truth() -> Trajectory | None:

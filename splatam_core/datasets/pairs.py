@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -250,6 +251,29 @@ def pair_up(
         ImagePair(base.nominal_stamp_ns(number - first, rate_hz), path, depth.get(number), own.get(number))
         for number, path in color.items()
     ]
+
+
+def with_missing(color: Mapping[int, Path], depth: Mapping[int, Path]) -> dict[int, Path]:
+    """Returns the colour files by number, with the names that are missing for depth images, so that each of these costs a frame.
+
+    Args:
+        color: files by number, whose names hold these numbers.
+        depth: likewise.
+    """
+    if not color:
+        return {}
+    like = next(iter(color.values()))
+    expected = {
+        number: like.with_name(_renumbered(like.name, next(iter(color)), number)) for number in depth if number not in color
+    }
+    return dict(sorted({**color, **expected}.items()))
+
+
+def _renumbered(name: str, number: int, other: int) -> str:
+    """Returns a file's name with another number; as many digits, if there are zeros in front."""
+    digits = [found for found in re.finditer(r'\d+', name) if int(found[0]) == number]
+    start, end = digits[-1].span()
+    return f'{name[:start]}{other:0{end - start if name[start] == "0" else 1}d}{name[end:]}'
 
 
 def trajectory(pairs: Sequence[ImagePair], poses: Sequence[NDArray[np.float64] | None]) -> Trajectory | None:

@@ -25,7 +25,7 @@ import numpy as np
 
 from splatam_core.datasets import base, files
 from splatam_core.datasets.camera_file import camera_of
-from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
+from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory, with_missing
 from splatam_core.errors import DatasetError
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
@@ -41,8 +41,8 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     """
     path = folder / 'metadata.json'
     metadata = files.read_json(path)
-    color = files.numbered(folder / 'rgb', r'(\d+)\.(?:jpg|png)')
     depth = files.numbered(folder / 'depth', r'(\d+)\.exr')
+    color = with_missing(files.numbered(folder / 'rgb', r'(\d+)\.(?:jpg|png)'), depth)
     with files.parsing(path):
         rate_hz = _rate_hz(metadata)
         cameras = _cameras(metadata, list(color))

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from splatam_core.datasets import base, files
 from splatam_core.datasets.camera_file import DatasetCamera, camera_of, checked_depth_scale, find_camera_file, say_assumed
-from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, row_trajectory
+from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, row_trajectory, with_missing
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 
 CAMERA = DatasetCamera(CameraCalibration(PinholeCamera(1200, 680, 600.0, 600.0, 599.5, 339.5)), 6553.5)
@@ -34,8 +34,8 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
         DatasetError: there are no frames, too many lack their depth, or ``cam_params.json`` cannot be used.
         CameraError: the camera cannot be used.
     """
-    color = files.numbered(folder / 'results', r'frame(\d+)\.(?:jpg|png)')
     depth = files.numbered(folder / 'results', r'depth(\d+)\.png')
+    color = with_missing(files.numbered(folder / 'results', r'frame(\d+)\.(?:jpg|png)'), depth)
     pairs = pair_up(color, depth, folder, 'results/frame000000.jpg with results/depth000000.png')
     own = _camera(folder)
     camera = camera_of(folder, lambda: own.calibration, own.depth_scale)

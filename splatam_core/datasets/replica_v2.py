@@ -22,7 +22,7 @@ from pathlib import Path
 
 from splatam_core.datasets import base, files, replica
 from splatam_core.datasets.camera_file import camera_of, say_assumed
-from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, row_trajectory
+from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, row_trajectory, with_missing
 from splatam_core.errors import DatasetError
 from splatam_core.geometry.camera import CameraCalibration
 
@@ -40,8 +40,8 @@ def read(folder: Path, *, split: str = 'train', width: int | None = None) -> Ima
     frames = folder / 'imap' / FOLDERS[split]
     if not frames.is_dir():
         raise DatasetError(f'{frames}: there is no such folder; split {split} is expected there')
-    color = files.numbered(frames / 'rgb', r'rgb_(\d+)\.png')
     depth = files.numbered(frames / 'depth', r'depth_(\d+)\.png')
+    color = with_missing(files.numbered(frames / 'rgb', r'rgb_(\d+)\.png'), depth)
     pairs = pair_up(color, depth, frames, 'rgb/rgb_0.png with depth/depth_0.png')
     camera = camera_of(folder, lambda: _assumed(folder), DEPTH_SCALE)
     return ImagePairs(

@@ -29,7 +29,7 @@ import numpy as np
 
 from splatam_core.datasets import base, files
 from splatam_core.datasets.camera_file import camera_of
-from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
+from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory, with_missing
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.trajectory import Trajectory
 
@@ -47,8 +47,9 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
         CameraError: the camera cannot be used.
     """
     frames = _frames(folder)
-    color = files.numbered(frames / 'color', r'(\d+)\.(?:jpg|png)')
-    pairs = pair_up(color, files.numbered(frames / 'depth', r'(\d+)\.png'), frames, 'color/0.jpg with depth/0.png')
+    depth_files = files.numbered(frames / 'depth', r'(\d+)\.png')
+    color = with_missing(files.numbered(frames / 'color', r'(\d+)\.(?:jpg|png)'), depth_files)
+    pairs = pair_up(color, depth_files, frames, 'color/0.jpg with depth/0.png')
     path = frames / 'intrinsic' / 'intrinsic_color.txt'
     camera = camera_of(
         folder,

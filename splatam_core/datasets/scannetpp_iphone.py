@@ -25,7 +25,7 @@ import numpy as np
 
 from splatam_core.datasets import base, files
 from splatam_core.datasets.camera_file import camera_of
-from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
+from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory, with_missing
 
 DEPTH_SCALE = 1000.0
 RATE_HZ = 60
@@ -40,8 +40,8 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
     """
     path = folder / 'pose_intrinsic_imu.json'
     stated = files.read_json(path)
-    color = files.numbered(folder / 'rgb', r'frame_(\d+)\.(?:jpg|png)')
     depth = files.numbered(folder / 'depth', r'frame_(\d+)\.png')
+    color = with_missing(files.numbered(folder / 'rgb', r'frame_(\d+)\.(?:jpg|png)'), depth)
     size = files.first_size(color.values()) if color else (0, 0)
     with files.parsing(path):
         frames = {number: stated[file.stem] for number, file in color.items()}

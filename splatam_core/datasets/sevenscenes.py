@@ -20,7 +20,7 @@ from pathlib import Path
 
 from splatam_core.datasets import base, files
 from splatam_core.datasets.camera_file import camera_of, say_assumed
-from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory
+from splatam_core.datasets.pairs import DepthFormat, ImagePairs, pair_up, trajectory, with_missing
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 from splatam_core.geometry.trajectory import Trajectory
 
@@ -36,8 +36,8 @@ def read(folder: Path, *, width: int | None = None) -> ImagePairs:
         DatasetError: there are no frames, too many lack their depth, or ``camera-intrinsics.txt`` is no 3x3 matrix.
         CameraError: its ``camera.yaml`` cannot be used.
     """
-    color = files.numbered(folder, r'frame-(\d{6})\.color\.(?:png|jpg)')
     depth = files.numbered(folder, r'frame-(\d{6})\.depth\.png')
+    color = with_missing(files.numbered(folder, r'frame-(\d{6})\.color\.(?:png|jpg)'), depth)
     pairs = pair_up(color, depth, folder, 'frame-000000.color.png (or .jpg) with frame-000000.depth.png')
     camera = camera_of(folder, lambda: _calibration(folder, (pair.color for pair in pairs)), DEFAULT_DEPTH_SCALE)
 

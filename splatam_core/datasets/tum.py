@@ -15,8 +15,9 @@ have (``intrinsics.txt``, see ``folder.py``), and depth is taken as millimetres 
 otherwise.
 
 Stamps may be milliseconds, microseconds or nanoseconds instead of seconds. A colour image is paired with the depth image
-nearest in time, at most 20 ms away. Each depth image is used at most once, and colour images without a partner are skipped.
-The frame has the colour image's stamp.
+nearest in time, at most half the time between colour images away (but 20 to 50 ms), or ``--max-interval``. Each depth image
+is used at most once, and colour images without a partner are skipped. Pairs in ``associations.txt`` are used as they are;
+``--max-interval`` leaves out those further apart. The frame has the colour image's stamp.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from splatam_core.text_files import read_text
 DEFAULT_DEPTH_SCALE = 5000.0
 MILLIMETRES = 1000.0
 ASSOCIATIONS = ('associations.txt', 'association.txt', 'associated.txt', 'associate.txt')
-MAX_INTERVAL_NS = 20_000_000
+LEAST_INTERVAL_NS, MOST_INTERVAL_NS = 20_000_000, 50_000_000  # as for bags and live topics
 
 KNOWN_CAMERAS = {
     '1': CameraCalibration(
@@ -79,15 +80,20 @@ class _Listed:
     name: str
 
 
-def read(folder: Path, *, width: int | None = None, max_interval_ns: int = MAX_INTERVAL_NS) -> ImagePairs:
+def read(folder: Path, *, width: int | None = None, max_interval_ns: int | None = None) -> ImagePairs:
     """Read the lists of a folder and pair its images.
+
+    Args:
+        folder: holds the lists.
+        width: width of the frames in pixels; None keeps the recorded size.
+        max_interval_ns: largest difference between the stamps of a pair; None adapts it to the rate.
 
     Raises:
         DatasetError: a list is missing or broken, no images pair up, or the camera is unknown.
         CameraError: its ``camera.yaml`` cannot be used.
     """
     associations = _associations(folder)
-    pairs = _pairs(folder, max_interval_ns) if associations is None else _associated(folder, associations)
+    pairs = _pairs(folder, max_interval_ns) if associations is None else _associated(folder, associations, max_interval_ns)
     camera = _camera(folder, pairs, is_own=associations is not None)
     path = folder / 'groundtruth.txt'
     return ImagePairs(
@@ -174,16 +180,25 @@ def _known_camera(folder: Path) -> CameraCalibration | None:
 # --- lists ---
 
 
-def _pairs(folder: Path, max_interval_ns: int) -> list[ImagePair]:
+def _pairs(folder: Path, max_interval_ns: int | None) -> list[ImagePair]:
     rgb, depth = _read_list(folder / 'rgb.txt'), _read_list(folder / 'depth.txt')
-    pairs = associate(_stamps_ns(rgb), _stamps_ns(depth), max_interval_ns)
+    color_ns, depth_ns = _stamps_ns(rgb), _stamps_ns(depth)
+    interval_ns = _usual_interval_ns(color_ns) if max_interval_ns is None else max_interval_ns
+    pairs = associate(color_ns, depth_ns, interval_ns)
     if not pairs:
         raise DatasetError(
-            f'{folder}: none of {len(rgb)} colour and {len(depth)} depth images are within '
-            f'{max_interval_ns / 1e6:g} ms of each other; do the stamps of both lists come from the same clock?'
+            f'{folder}: none of {len(rgb)} colour and {len(depth)} depth images are within {interval_ns / 1e6:g} ms of each other'
+            f'{base.nearest_depth(color_ns, depth_ns)}'
         )
     found = [(rgb[i], depth[j]) for i, j in pairs]
     return [ImagePair(c.stamp_ns, files.listed(folder, c.name), files.listed(folder, d.name)) for c, d in found]
+
+
+def _usual_interval_ns(color_ns: NDArray[np.int64]) -> int:
+    """Returns half the median time between colour images, within limits."""
+    if len(color_ns) < 2:
+        return LEAST_INTERVAL_NS
+    return min(max(int(np.median(np.diff(color_ns))) // 2, LEAST_INTERVAL_NS), MOST_INTERVAL_NS)
 
 
 def _stamps_ns(rows: list[_Listed]) -> NDArray[np.int64]:
@@ -197,8 +212,14 @@ def _associations(folder: Path) -> Path | None:
     return next((folder / name for name in ASSOCIATIONS if (folder / name).is_file()), None)
 
 
-def _associated(folder: Path, path: Path) -> list[ImagePair]:
-    """Read a list of pairs. Which of the two images is depth is told by the paths; if they do not tell, it is the second."""
+def _associated(folder: Path, path: Path, max_interval_ns: int | None) -> list[ImagePair]:
+    """Read a list of pairs. Which of the two images is depth is told by the paths; if they do not tell, it is the second.
+
+    Args:
+        folder: holds the images.
+        path: the list.
+        max_interval_ns: pairs further apart are left out, with a warning; None = none is.
+    """
     rows = list(_rows(path, 'stamp path stamp path', lambda line: _fields(line.split(), 4)))
     if not rows:
         raise DatasetError(f'{path}: no pair in it; expected lines with stamp, path of colour, stamp, path of depth')
@@ -206,9 +227,14 @@ def _associated(folder: Path, path: Path) -> list[ImagePair]:
     says_depth = [sum('depth' in row.name.lower() for row in side) for side in (first, second)]
     color, depth = (second, first) if says_depth[0] > says_depth[1] else (first, second)
     _check_increasing(path, color)
-    return [
-        ImagePair(c.stamp_ns, files.listed(folder, c.name), files.listed(folder, d.name)) for c, d in zip(color, depth, strict=True)
-    ]
+    pairs = list(zip(color, depth, strict=True))
+    near = [pair for pair in pairs if max_interval_ns is None or abs(pair[0].stamp_ns - pair[1].stamp_ns) <= max_interval_ns]
+    if max_interval_ns is not None and len(near) < len(pairs):
+        apart = f'{path}: {len(pairs) - len(near)} of {len(pairs)} pairs are more than {max_interval_ns / 1e6:g} ms apart'
+        if not near:
+            raise DatasetError(f'{apart}{base.nearest_depth(_stamps_ns(color), _stamps_ns(depth))}')
+        _log.warning('%s and left out', apart)
+    return [ImagePair(c.stamp_ns, files.listed(folder, c.name), files.listed(folder, d.name)) for c, d in near]
 
 
 def _read_list(path: Path) -> list[_Listed]:
@@ -269,7 +295,10 @@ def _accepts(source: str) -> bool:
 
 
 def _open(source: str, options: base.ReadOptions) -> ImagePairs:
-    return read(Path(source), width=options.width)
+    interval_s = options.max_interval_s
+    return read(Path(source), width=options.width, max_interval_ns=None if interval_s is None else round(interval_s * 1e9))
 
 
-FORMAT = base.Format('tum', 'a folder with rgb.txt and depth.txt, or associations.txt', _recognises, _open, accepts=_accepts)
+FORMAT = base.Format(
+    'tum', 'a folder with rgb.txt and depth.txt, or associations.txt', _recognises, _open, accepts=_accepts, pairs_by_stamp=True
+)

@@ -10,14 +10,14 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from splatam_core.config import SlamConfig, load_config, parse_overrides, read_values
 from splatam_core.errors import ConfigError, RunFolderError
 from splatam_core.resources import config_dir
 from splatam_core.runs.layout import METRICS, RUN
 from splatam_core.runs.metrics import Metrics
-from splatam_core.runs.record import Source, read_run
+from splatam_core.runs.record import RunSettings, Source, read_run, read_settings
+from splatam_core.text_files import read_text
 
 FULL = 'full'
 
@@ -104,6 +104,9 @@ def table(folders: Mapping[str, Path]) -> str:
 
     Args:
         folders: name of a variant to its run folder.
+
+    Raises:
+        RunFolderError: the numbers of a run are damaged.
     """
     lines = [COLUMNS, ('---',) * len(COLUMNS), *(_row(name, folder) for name, folder in folders.items())]
     return '\n'.join('| ' + ' | '.join(cells) + ' |' for cells in lines)
@@ -113,7 +116,7 @@ def _row(name: str, folder: Path) -> tuple[str, ...]:
     path = folder / METRICS
     if not path.is_file():
         return (name, *('–' for _ in COLUMNS[1:]))
-    m = Metrics.from_json(path.read_text())
+    m = Metrics.from_json(read_text(path, RunFolderError))
     return (
         name, f'{m.tracked}/{m.frames}', _text(m.ate_rmse_m, 100, '.2f'), _text(m.depth_l1_m, 100, '.2f'),
         _text(m.psnr_db, 1, '.2f'), _text(m.ssim, 1, '.3f'), _text(m.num_gaussians, 1, ','),
@@ -126,12 +129,16 @@ def _text(value: float | None, factor: float, digits: str) -> str:
 
 
 def provenance(folders: Iterable[Path]) -> str:
-    """Returns commit and machine of some runs; each combination once."""
-    facts = [json.loads((folder / RUN).read_text()) for folder in folders if (folder / RUN).is_file()]
+    """Returns commit and machine of some runs; each combination once.
+
+    Raises:
+        RunFolderError: a run is damaged.
+    """
+    facts = [read_settings(folder) for folder in folders if (folder / RUN).is_file()]
     return '; '.join(dict.fromkeys(map(_provenance, facts)))
 
 
-def _provenance(fact: dict[str, Any]) -> str:
-    machine = fact['machine']
-    commit, _, dirty = (fact['commit'] or 'unknown').partition('-')
-    return f'commit `{commit[:12]}{"-" * bool(dirty)}{dirty}`, {machine["processor"]}, {machine["cores"]} cores'
+def _provenance(fact: RunSettings) -> str:
+    commit, _, dirty = (fact.commit or 'unknown').partition('-')
+    machine = [fact.machine.get(name, 'unknown') for name in ('processor', 'cores')]
+    return f'commit `{commit[:12]}{"-" * bool(dirty)}{dirty}`, {machine[0]}, {machine[1]} cores'

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from splatam_core.config import SlamConfig
 from splatam_core.images.view import View, narrowing
+from splatam_core.interruption import Stop, never
 from splatam_core.mapping.densification import densify
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.keyframes import KeyframeStore, Window, select_keyframes, views_to_fit
@@ -18,6 +22,11 @@ from splatam_core.mapping.posed import PosedFrame, PosedView
 from splatam_core.mapping.schedule import MappingPlan, MappingSchedule
 from splatam_core.rasterizer import Rasterizer
 from splatam_core.types import Arrays
+
+_log = logging.getLogger(__name__)
+
+_KEPT = 0.9
+"""Fraction of the largest number of Gaussians that is kept when it is exceeded, so that few frames copy the map."""
 
 _MAX_GROWTH = 2.0
 """A Gaussian may grow to this many times its first radius, however near the surfaces of the first frame were."""
@@ -34,7 +43,9 @@ class Mapper:
         scene_radius: metres; 0 before the first frame.
     """
 
-    def __init__(self, config: SlamConfig, rasterizer: Rasterizer, device: torch.device, num_frames: int | None) -> None:
+    def __init__(
+        self, config: SlamConfig, rasterizer: Rasterizer, device: torch.device, num_frames: int | None, stop: Stop = never
+    ) -> None:
         """Begins with an empty map.
 
         Args:
@@ -42,12 +53,13 @@ class Mapper:
             rasterizer: draws the map.
             device: where the map is computed.
             num_frames: number of frames of the recording; None where that is unknown.
+            stop: asked before each step of ``optimize``.
         """
         self.map = GaussianMap(config.mapping.anisotropic, device)
         self.keyframes = KeyframeStore(device, config.keyframes)
         self.rng = np.random.default_rng(config.seed)
         self.scene_radius = 0.0
-        self._rasterizer, self._num_frames = rasterizer, num_frames
+        self._rasterizer, self._num_frames, self._stop = rasterizer, num_frames, stop
         self.configure(config)
 
     def configure(self, config: SlamConfig) -> None:
@@ -63,6 +75,24 @@ class Mapper:
         self._measure_scene(frame.observation.host)
         if plan.densifies:
             densify(self.map, frame.device.view, frame.device.T_cam_world, self._rasterizer, self._config.densification)
+            self._limit_size(frame.device.T_cam_world)
+
+    def _limit_size(self, T_cam_world: Tensor) -> None:
+        """Drops the Gaussians farthest from the camera, if there are too many."""
+        limit, size = self._config.mapping.max_gaussians, len(self.map)
+        if not 0 < limit < size:
+            return
+        camera = -T_cam_world[:3, :3].T @ T_cam_world[:3, 3]
+        distance = torch.linalg.vector_norm(self.map.means.detach() - camera, dim=1)
+        num_kept = max(1, round(_KEPT * limit))
+        kept = torch.zeros(size, dtype=torch.bool, device=distance.device)
+        kept[torch.topk(distance, num_kept, largest=False).indices] = True
+        farthest_m = float(distance[kept].max())
+        self.map.keep(kept)
+        _log.warning(
+            'the map has reached mapping.max_gaussians = %d: the %d farthest from the camera, more than %.1f m away, are dropped',
+            limit, size - num_kept, farthest_m,
+        )  # fmt: skip
 
     def select(self, frame: PosedFrame, plan: MappingPlan) -> Window:
         """Returns the views to fit the map to, the frame last; keeps the frame as a keyframe where the plan says so."""
@@ -80,7 +110,7 @@ class Mapper:
         if plan.steps is None or not window:
             return
         views = views_to_fit(window, plan.steps, self._config, self.rng)
-        self._optimizer.fit(self.map, views, self.scene_radius)
+        self._optimizer.fit(self.map, takewhile(lambda _: not self._stop(), views), self.scene_radius)
 
     def finish(self, limit: TimeLimit) -> int:
         """Fits the map to all keyframes once more, after the last frame. Returns the number of steps."""

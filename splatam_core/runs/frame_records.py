@@ -109,6 +109,11 @@ def complete_lines(path: Path) -> list[str]:
     return whole[:end].split('\n')[:-1]
 
 
+def is_frame(line: str) -> bool:
+    """Returns True if a line of a ``trajectory.txt`` is a frame, tracked or lost."""
+    return line.startswith(LOST) or bool(line.strip() and not line.lstrip().startswith('#'))
+
+
 def read_poses(lines: Iterable[str], name: str) -> Trajectory:
     """Returns the poses in the lines of a ``trajectory.txt``.
 

@@ -18,11 +18,11 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 from pathlib import Path
 
 from splatam_core.errors import RunFolderError, one_line
+from splatam_core.text_files import read_json
 
 TRAJECTORY = 'trajectory.txt'
 FRAMES = 'frames.csv'
@@ -105,7 +105,7 @@ def _why_no_run(path: Path) -> str:
     if file.is_symlink() or not file.is_file():
         return f'{RUN} is missing'
     try:
-        information = json.loads(file.read_text(encoding='utf-8'))
+        information = read_json(file, RunFolderError)
         if information['program'] in PROGRAMS and {'source', 'camera', 'versions'} <= information.keys():
             return ''
     except Exception:  # noqa: BLE001 - whatever it holds, it is not ours

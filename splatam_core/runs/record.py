@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import json
+import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -18,12 +19,15 @@ from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.trajectory import Trajectory
 from splatam_core.maps.ply import read_ply
 from splatam_core.rasterizer import Gaussians
-from splatam_core.runs.frame_records import FrameRecord, complete_lines, read_frame_records, read_lost, read_poses
+from splatam_core.runs.frame_records import FrameRecord, complete_lines, is_frame, read_frame_records, read_lost, read_poses
 from splatam_core.runs.layout import CONFIG, FRAMES, MAP, METRICS, RUN, TRAJECTORY, why_not
 from splatam_core.runs.metrics import Metrics, run_metrics
+from splatam_core.text_files import read_json, read_text
 
 KEEP_CHECKPOINTS = 2
 Made = TypeVar('Made')
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,8 +170,8 @@ class RunRecord(RunSettings):
         if not path.exists():
             return run_metrics(self.frames)
         try:
-            return Metrics.from_json(path.read_text(encoding='utf-8'))
-        except (RunFolderError, OSError, UnicodeDecodeError) as error:
+            return Metrics.from_json(read_text(path, RunFolderError))
+        except RunFolderError as error:
             raise RunFolderError(f'{self.path}: {one_line(error)}') from None
 
 
@@ -178,7 +182,7 @@ def read_settings(path: Path) -> RunSettings:
         RunFolderError: the path is no run folder, or one of its files is damaged.
     """
     with read_errors(path):
-        information = json.loads((path / RUN).read_text(encoding='utf-8'))
+        information = read_json(path / RUN, RunFolderError)
         source, camera = information['source'], information['camera']
         description = {name: information[name] for name in ('program', 'preset')}
         description |= {name: information[name] for name in ('checkpoint_every', 'keep_checkpoints') if name in information}
@@ -221,7 +225,7 @@ def read_run(path: Path) -> RunRecord:
     """
     settings = read_settings(path)
     with read_errors(path):
-        lines = complete_lines(path / TRAJECTORY)
+        lines, records = _in_both(path, complete_lines(path / TRAJECTORY), read_frame_records(path / FRAMES))
         return RunRecord(
             path=path,
             config=settings.config,
@@ -232,8 +236,30 @@ def read_run(path: Path) -> RunRecord:
             versions=settings.versions,
             trajectory=read_poses(lines, TRAJECTORY),
             lost_ns=read_lost(lines),
-            frames=read_frame_records(path / FRAMES),
+            frames=records,
         )
+
+
+def _in_both(path: Path, lines: list[str], records: tuple[FrameRecord, ...]) -> tuple[list[str], tuple[FrameRecord, ...]]:
+    """Leaves out the last frames that only one file has, with a warning: the writer was stopped between two lines.
+
+    Args:
+        path: the run folder.
+        lines: of ``trajectory.txt``.
+        records: of ``frames.csv``; any number of lines is right if there is no such file.
+
+    Raises:
+        ValueError: a line is no pose.
+    """
+    numbers = [number for number, line in enumerate(lines, 1) if is_frame(line)]
+    count = min(len(numbers), len(records))
+    alone = max(len(numbers), len(records)) - count
+    if not alone or not (path / FRAMES).exists():
+        return lines, records
+    for read in (partial(read_poses, name=TRAJECTORY), read_lost):  # what is left out must be a frame, too
+        read(lines)
+    _log.warning('%s: the last %d frames are in one of %s and %s only, and left out', path, alone, TRAJECTORY, FRAMES)
+    return lines[: numbers[count - 1] if count else 0], records[:count]
 
 
 @contextmanager

@@ -14,10 +14,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
 
-from splatam_core.atomic_io import new_folder, replace_text
+from splatam_core.atomic_io import new_folder, prepared, replace_text, same_file
 from splatam_core.config import SlamConfig, to_yaml
 from splatam_core.device import choose_backend
-from splatam_core.errors import RunFolderError, one_line
+from splatam_core.errors import RunFolderError
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.trajectory import stamp_from_text
 from splatam_core.mapping.gaussian_map import GaussianMap
@@ -43,6 +43,7 @@ from splatam_core.runs.layout import (
 from splatam_core.runs.line_file import LineFile
 from splatam_core.runs.metrics import FrameStatistics, Metrics
 from splatam_core.runs.record import RunDescription, RunRecord, read_errors, read_run
+from splatam_core.text_files import read_json
 from splatam_core.types import FrameResult, RgbdFrame
 
 
@@ -140,26 +141,34 @@ class RunFolder:
         return self._statistics.frames
 
     def restarted(self, config: SlamConfig) -> RunFolder:
-        """Begins a new run in the same folder, after a reset. Closes this object.
+        """Begins a new run in the same folder, after a reset. Closes this object if that succeeds.
 
         The run so far moves to ``previous/``, itself a run folder, and replaces what was there.
 
         Raises:
-            RunFolderError: the folder cannot be written; nothing more can be appended then.
+            RunFolderError: the folder cannot be written; nothing has changed.
         """
-        previous = self.path / PREVIOUS
+        information = _information(self.path) | {'camera': None, 'started': _now()}
+        texts = {CONFIG: to_yaml(config), RUN: _to_json(information), FRAMES: _csv_row(CSV_HEADER) + '\n'}
         try:
+            self.sync()
+            (self.path / PREVIOUS).mkdir(exist_ok=True)
+            with prepared({self.path / name: text for name, text in texts.items()}) as put_in_place:
+                self._move_to_previous()
+                put_in_place()
             self.close()
-            remove_previous(self.path)
-            previous.mkdir(exist_ok=True)
-            shutil.copy2(self.path / RUN, previous)  # a copy: RUN marks a run folder, so it must not be missing meanwhile
-            for name in FILES:
-                if name != RUN and (self.path / name).exists():
-                    (self.path / name).replace(previous / name)
-            information = _information(previous)
-            return self._begin(self.path, config, information | {'camera': None, 'started': _now()})
+            return RunFolder(self.path)
         except OSError as error:
             raise RunFolderError(f'{self.path}: a new run cannot begin: {why_not(error)}') from None
+
+    def _move_to_previous(self) -> None:
+        previous = self.path / PREVIOUS
+        remove_previous(self.path)
+        previous.mkdir(exist_ok=True)
+        same_file(self.path / RUN, previous / RUN)  # not moved: RUN marks a run folder, so it must not be missing meanwhile
+        for name in FILES:
+            if name != RUN and (self.path / name).exists():
+                (self.path / name).replace(previous / name)
 
     def moved(self, path: Path) -> RunFolder:
         """Continues in another folder, with a copy of this one. Closes this object if that succeeds.
@@ -314,13 +323,9 @@ def _information(path: Path) -> dict[str, Any]:
     """Returns what ``run.json`` in a folder holds.
 
     Raises:
-        RunFolderError: it is damaged.
-        OSError: it cannot be read.
+        RunFolderError: it cannot be read.
     """
-    try:
-        information = json.loads((path / RUN).read_text(encoding='utf-8'))
-    except (ValueError, RecursionError) as error:
-        raise RunFolderError(f'{path / RUN} cannot be read: {one_line(error)}') from None
+    information = read_json(path / RUN, RunFolderError)
     if not isinstance(information, dict):
         raise RunFolderError(f'{path / RUN} cannot be read: it holds no object')
     return information

@@ -23,6 +23,7 @@ from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.view import View
+from splatam_core.interruption import Stop, never
 from splatam_core.rasterizer import Gaussians, Rasterizer, Render
 from splatam_core.rasterizer.native import make_native_aligner
 from splatam_core.tracking.aligner import Aligner
@@ -57,7 +58,9 @@ class _Frame:
 class AlignmentTracker:
     """Aligns frames to renders of the map."""
 
-    def __init__(self, rasterizer: Rasterizer, config: TrackingConfig, threads: int, device: torch.device) -> None:
+    def __init__(
+        self, rasterizer: Rasterizer, config: TrackingConfig, threads: int, device: torch.device, stop: Stop = never
+    ) -> None:
         self._rasterizer = rasterizer
         self._config = config
         self._aligner = make_aligner(threads, device)

@@ -7,6 +7,7 @@ import torch
 from splatam_core.config import TrackingConfig
 from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.view import View
+from splatam_core.interruption import Stop, never
 from splatam_core.rasterizer import Gaussians, Rasterizer
 from splatam_core.tracking.base import TrackingResult
 from splatam_core.tracking.time_offset import TimeOffset
@@ -18,7 +19,9 @@ class NullTracker:
     For mapping along given poses, and for measuring everything but tracking.
     """
 
-    def __init__(self, rasterizer: Rasterizer, config: TrackingConfig, threads: int, device: torch.device) -> None:
+    def __init__(
+        self, rasterizer: Rasterizer, config: TrackingConfig, threads: int, device: torch.device, stop: Stop = never
+    ) -> None:
         pass
 
     def track(

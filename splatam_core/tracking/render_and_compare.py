@@ -12,6 +12,7 @@ from splatam_core.geometry import se3
 from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.filters import is_on_host
 from splatam_core.images.view import View
+from splatam_core.interruption import Stop, check, never
 from splatam_core.rasterizer import Gaussians, Rasterizer
 from splatam_core.tracking.base import TrackingResult
 from splatam_core.tracking.candidate import Candidate
@@ -23,9 +24,12 @@ from splatam_core.tracking.verdict import compare
 class RenderAndCompareTracker:
     """Returns the best of all poses that it evaluates, the predicted one included."""
 
-    def __init__(self, rasterizer: Rasterizer, config: TrackingConfig, threads: int, device: torch.device) -> None:
+    def __init__(
+        self, rasterizer: Rasterizer, config: TrackingConfig, threads: int, device: torch.device, stop: Stop = never
+    ) -> None:
         self._rasterizer = rasterizer
         self._config = config
+        self._stop = stop
 
     def track(
         self,
@@ -50,6 +54,7 @@ class RenderAndCompareTracker:
         predicted: Candidate | None = None
         steps = config.iterations
         for step in itertools.count():
+            check(self._stop)
             pose = _pose(rotation, translation)
             render = self._rasterizer.render(gaussians, view.camera, pose)
             loss = tracking_loss(render, view, config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -20,21 +21,24 @@ from splatam_ros.node.stamp_filter import StampFilter
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 T = TypeVar('T')
+MIN_EQUAL = 6  # images with one stamp, beside the first two, from a driver that does not stamp
 
 
 class FrameAssembler:
     """Turns the three streams of a camera into frames. Unusable input is skipped with a warning; nothing raises."""
 
     def __init__(
-        self, options: NodeOptions, warnings: ThrottledWarnings, gate: FrameGate, on_rejected: Callable[[int], None]
-    ) -> None:
+        self, options: NodeOptions, warnings: ThrottledWarnings, gate: FrameGate, on_rejected: Callable[[int], None],
+        now_ns: Callable[[], int] = time.time_ns,
+    ) -> None:  # fmt: skip
         """Start without messages.
 
         Args:
             options: the node's options.
             warnings: receives a warning about each input that is skipped.
             gate: decides about each frame before it is decoded.
-            on_rejected: called with the stamp (ns) of each frame that the gate rejects, or whose stamp is wrong.
+            on_rejected: called with the stamp (ns) of each frame that the gate rejects, that has a wrong stamp, or cannot be used.
+            now_ns: the node's clock, for ``use_receive_time``.
         """
         jump_ns = round(options.time_jump_threshold * 1e9)
         self._synchronizer = RgbdSynchronizer(
@@ -49,6 +53,7 @@ class FrameAssembler:
         self._warnings = warnings
         self._gate = gate
         self._on_rejected = on_rejected
+        self._now_ns = now_ns if options.use_receive_time else None
         self._reported = self._synchronizer.statistics
 
     @property
@@ -63,11 +68,11 @@ class FrameAssembler:
 
     def add_color(self, message: Any) -> list[RgbdFrame]:
         """Add a colour image; returns the frames that it completes."""
-        return self._frames(self._synchronizer.add_color(stamps.message_stamp_ns(message), message))
+        return self._frames(self._synchronizer.add_color(self._stamp_ns(message), message))
 
     def add_depth(self, message: Any) -> list[RgbdFrame]:
         """Add a depth image; returns the frames that it completes."""
-        return self._frames(self._synchronizer.add_depth(stamps.message_stamp_ns(message), message))
+        return self._frames(self._synchronizer.add_depth(self._stamp_ns(message), message))
 
     def add_info(self, message: Any) -> list[RgbdFrame]:
         """Add a CameraInfo; returns the frames that waited for the first one. An invalid one is ignored."""
@@ -82,7 +87,7 @@ class FrameAssembler:
             self._remark('info', remarks.on_info(message))
         else:
             self._has_k = True
-        return self._frames(self._synchronizer.add_info(stamps.message_stamp_ns(message), parameters))
+        return self._frames(self._synchronizer.add_info(self._stamp_ns(message), parameters))
 
     def flush(self) -> list[RgbdFrame]:
         """Returns the frames that can be assembled without further messages; unpaired images are dropped."""
@@ -92,11 +97,17 @@ class FrameAssembler:
         """Warn about the messages that the synchronizer has dropped since the last report."""
         before, now = self._reported, self._synchronizer.statistics
         self._reported = now
-        self._report('duplicates', now.duplicates - before.duplicates, 'an image with the same stamp was received before')
+        if now.sets <= 1 and now.duplicates >= MIN_EQUAL:
+            self._warnings.warn('not stamped', f'all stamps are equal: {remarks.NOT_STAMPED}')
+        else:
+            self._report('duplicates', now.duplicates - before.duplicates, 'an image with the same stamp was received before')
         self._report('late', now.late - before.late, 'older than the last frame; do the stamps increase?')
         self._report('color', now.unpaired_color - before.unpaired_color, f'colour without depth{_gap(now)}')
         self._report('depth', now.unpaired_depth - before.unpaired_depth, f'depth without colour{_gap(now)}')
         self._report('without info', now.without_info - before.without_info, 'paired, but no CameraInfo was received')
+
+    def _stamp_ns(self, message: Any) -> int:
+        return stamps.message_stamp_ns(message) if self._now_ns is None else self._now_ns()
 
     def _report(self, kind: str, count: int, why: str) -> None:
         if count > 0:
@@ -106,8 +117,13 @@ class FrameAssembler:
         return self._admitted([right for found in sets for right in self._stamps.add(found)])
 
     def _admitted(self, sets: list[RgbdSet]) -> list[RgbdFrame]:
-        frames = [self._attempt('frame', self._frame, found) for found in sets if self._is_admitted(found)]
-        return [frame for frame in frames if frame is not None]
+        return [frame for found in sets if self._is_admitted(found) and (frame := self._decoded(found)) is not None]
+
+    def _decoded(self, found: RgbdSet) -> RgbdFrame | None:
+        frame = self._attempt('frame', self._frame, found)
+        if frame is None:
+            self._on_rejected(found.stamp_ns)  # a player may wait for its answer
+        return frame
 
     def _drop_wrong_stamp(self, found: RgbdSet, last_ns: int) -> None:
         self._warnings.warn(

@@ -81,7 +81,7 @@ def why_no_frames(node: Node, inputs: Sequence[MonitoredSubscription], statistic
         why = '; '.join(filter(None, ['though there is a publisher', _why_clock_stands(node)]))
         stopped_s = now_s - max(item.last_received_s for item in stopped)
         return f'nothing was received on {_topics(stopped)} for {stopped_s:.0f} s, {why}'
-    if statistics.newest_gap_ns is not None:
+    if statistics.newest_gap_ns is not None and abs(statistics.newest_gap_ns) > statistics.max_interval_ns:
         return (
             f'colour and depth are received, but nothing pairs: the stamps of the newest two are '
             f'{abs(statistics.newest_gap_ns) / 1e9:.3f} s apart, and {_allowed(options, statistics)}'

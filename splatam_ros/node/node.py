@@ -71,13 +71,13 @@ class SplatamNode(Node):
         )
         self._outputs = Outputs(self, options, self._frames)
         self._lifecycle = MapLifecycle(options, config, logger, self._frames, self._outputs)
-        self._slam = Slam(config, self._frames.prior)
+        self._slam = Slam(config, self._frames.prior, stop=self._is_out_of_time)
         if self._slam.backend.why:
             logger.info(str(self._slam.backend))
         if options.load_path:
             self._lifecycle.load(self._slam)
         self._gate = FrameGate(options.max_rate_hz)
-        assembler = FrameAssembler(options, self._warnings, self._gate, self._outputs.publish_processed)
+        assembler = FrameAssembler(options, self._warnings, self._gate, self._outputs.publish_processed, self._now_ns)
         self._camera = CameraInput(self, options, assembler, self._submit)
         self._watchdog = InputWatchdog(self, self._camera.subscriptions)
         self._warn_of_unused_overrides()
@@ -115,6 +115,9 @@ class SplatamNode(Node):
             self.is_finished = True
         else:
             self._watchdog.report_frame()
+
+    def _now_ns(self) -> int:
+        return self.get_clock().now().nanoseconds
 
     def _is_out_of_time(self) -> bool:
         """True if frames that wait for SLAM must be dropped, so that the node ends in time."""

@@ -92,6 +92,8 @@ NODE_SETTINGS: tuple[Setting, ...] = (
              's', 0.0, 10.0),
     _setting('sync.queue_size', 30, 'Number of colour and of depth images that can wait for a partner. Increase when one '
              'stream arrives much later than the other.', '', 1, 1000),
+    _setting('use_receive_time', False, 'Stamp images with the time at which they are received, for drivers that do not stamp. '
+             'Colour and depth must then be sent together.'),
     _setting('on_time_jump', 'reset', 'What to do when stamps jump back, e.g. when a recording loops: reset = start a new map, '
              'continue = keep the map and continue from the last pose.',
              choices=('reset', 'continue')),
@@ -158,6 +160,7 @@ class NodeOptions:
     sync_mode: Mode
     sync_max_interval: float
     sync_queue_size: int
+    use_receive_time: bool
     on_time_jump: str
     time_jump_threshold: float
     on_camera_change: str

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 from splatam_core.config import SlamConfig
 from splatam_core.errors import ConfigError, RunFolderError, SplatamError
+from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.runs.metrics import Metrics
 from splatam_core.runs.record import RunDescription
 from splatam_core.runs.writer import RunFolder
@@ -18,6 +22,33 @@ from splatam_ros.node.parameters import NodeOptions
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 PROGRAM = 'splatam_node'
+MAX_WAITING_FRAMES = 10_000  # five minutes at 30 Hz, 10 MB
+RETRY_S = 5.0
+
+
+@dataclass(slots=True)
+class Waiting:
+    """A run that has ended, whose map does not fit on the disk, and the frames of the run after it. A ``SavableSlam``.
+
+    Attributes:
+        config: the settings of its end.
+        map: its map.
+        is_saved: True once the map is on the disk.
+        frames: the frames since then, without their images.
+    """
+
+    config: SlamConfig
+    map: GaussianMap
+    is_saved: bool
+    frames: list[tuple[RgbdFrame, FrameResult]] = field(default_factory=list)
+
+    def add(self, frame: RgbdFrame, result: FrameResult) -> bool:
+        """Keep a frame. Returns False if there are too many."""
+        if len(self.frames) >= MAX_WAITING_FRAMES:
+            return False
+        no_images = replace(frame, rgb=np.zeros((1, 1, 3), np.uint8), depth_m=np.zeros((1, 1), np.float32))
+        self.frames.append((no_images, result))
+        return True
 
 
 class RunRecorder:
@@ -39,6 +70,8 @@ class RunRecorder:
         self._logger = logger
         self._warnings = ThrottledWarnings(logger)
         self._folder: RunFolder | None = None
+        self._waiting: Waiting | None = None
+        self._retry_s = 0.0
         if options.folder is not None:
             self._folder = RunFolder.create(options.folder, config, self._description, overwrite=options.overwrite)
 
@@ -55,10 +88,16 @@ class RunRecorder:
         """Record a frame. If it cannot be written, warn and continue."""
         if self._folder is None:
             return
+        if self._ends_run():
+            self._append(self._folder, frame, result)
+        elif self._waiting is not None and not self._waiting.add(frame, result):
+            self._warnings.warn('trajectory', f'{self._folder.path}: a frame is lost: {MAX_WAITING_FRAMES} wait for room already')
+
+    def _append(self, folder: RunFolder, frame: RgbdFrame, result: FrameResult) -> None:
         try:
-            self._folder.append(frame, result, result.timings.total / 1e3)
+            folder.append(frame, result, result.timings.total / 1e3)
         except Exception as error:  # noqa: BLE001 - whatever happened to the folder, SLAM continues
-            self._warnings.warn('trajectory', f'{self._folder.path}: a frame could not be recorded: {why(error)}')
+            self._warnings.warn('trajectory', f'{folder.path}: a frame could not be recorded: {why(error)}')
 
     def save(self, slam: Slam, finish_s: float = 0.0) -> Metrics:
         """Save map, trajectory and metrics in ``save_path``.
@@ -73,6 +112,8 @@ class RunRecorder:
         path = self._options.folder
         if path is None:
             raise ConfigError('save_path is empty: set it to the folder to save in')
+        if not self._ends_run(at_once=True):
+            raise RunFolderError(f'{path}: cannot be saved: the run before the last reset waits for room; make room and save again')
         if self._folder is None:
             self._folder = RunFolder.create(path, slam.config, self._description)
         elif self._folder.path != path:
@@ -114,6 +155,8 @@ class RunRecorder:
         if self._folder is None or self._folder.is_empty:
             return
         try:
+            if not self._ends_run(at_once=True):
+                raise RunFolderError('the one before the last reset waits for room')
             self._folder.save(slam)
         except (OSError, SplatamError) as error:
             reason = f'the map so far cannot be saved: {why(error)}; nothing has changed, make room and try again'
@@ -122,32 +165,52 @@ class RunRecorder:
     def start_over(self, slam: Slam, *, is_saved: bool = False) -> str:
         """Start a new run in the same folder. The run so far, with its map, moves to ``previous/``.
 
-        If the disk fails, log the error and continue without recording.
+        If the disk is full, map and frames wait in memory until there is room.
 
         Args:
             slam: has the map of the run so far, unless that is saved already.
             is_saved: True if ``secure`` has saved it.
 
         Returns:
-            Where the run so far is, as the end of a sentence; empty if nothing is recorded.
+            Where the run so far is, as the end of a sentence; empty if nothing is recorded, or if it waits for room.
         """
         if self._folder is None:
             return ''
-        if not self._folder.is_empty:
-            self._move_to_previous(self._folder, slam, is_saved)
-        return f'; the run so far is in {self._folder.path / "previous"}' if self._folder else ''
+        if self._waiting is not None:
+            if self._waiting.frames:
+                self._logger.error(f'{self._folder.path}: {len(self._waiting.frames)} frames of the run so far are lost: no room')
+            self._waiting.frames.clear()
+        elif not self._folder.is_empty:
+            self._waiting = Waiting(slam.config, slam.map, is_saved)
+        return f'; the run so far is in {self._folder.path / "previous"}' if self._ends_run(at_once=True) else ''
 
-    def _move_to_previous(self, folder: RunFolder, slam: Slam, is_saved: bool) -> None:
+    def _ends_run(self, *, at_once: bool = False) -> bool:
+        """Move the run that has ended to ``previous/``, if one waits for that. Returns False if there is no room yet.
+
+        Args:
+            at_once: True to try now, False to try every few seconds.
+        """
+        folder, waiting = self._folder, self._waiting
+        if folder is None or waiting is None:
+            return True
+        if not at_once and time.monotonic() < self._retry_s:
+            return False
         try:
-            if not is_saved:
-                folder.save(slam)
+            if not waiting.is_saved:
+                folder.save(waiting)
+                waiting.is_saved = True
+            self._folder = restarted = folder.restarted(waiting.config)
         except (OSError, SplatamError) as error:
-            self._logger.error(f'{folder.path}: the map before the reset could not be saved: {why(error)}')
-        try:
-            self._folder = folder.restarted(slam.config)
-        except RunFolderError as error:
-            self._logger.error(f'{error}; frames are no longer recorded')
-            self._folder = None
+            self._retry_s = time.monotonic() + RETRY_S
+            self._warnings.warn(
+                'reset', f'{folder.path}: the run before the reset cannot be saved: {why(error)}; its map and the frames since '
+                'wait in memory for room on the disk',
+            )  # fmt: skip
+            return False
+        self._waiting = None
+        for frame, result in waiting.frames:
+            self._append(restarted, frame, result)
+        return True
 
     def close(self) -> None:
         """Close the folder's files."""

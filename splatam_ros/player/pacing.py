@@ -155,14 +155,16 @@ class Backlog:
         """Record that a colour image was published."""
         self.num_colors += 1
         self._interval.add_color(stamp_ns)
-        is_complete = not self._needs_depth or any(self._pairs(stamp_ns, depth_ns) for depth_ns in self._depths_ns)
+        interval_ns = self._interval.ns
+        is_complete = not self._needs_depth or any(abs(stamp_ns - depth_ns) <= interval_ns for depth_ns in self._depths_ns)
         self._unanswered.append(PublishedColor(self.num_colors, stamp_ns, is_complete))
 
     def depth(self, stamp_ns: int) -> None:
         """Record that a depth image was published."""
         self._depths_ns.append(stamp_ns)
+        interval_ns = self._interval.ns
         for image in self._unanswered:
-            image.is_complete |= self._pairs(image.stamp_ns, stamp_ns)
+            image.is_complete |= abs(image.stamp_ns - stamp_ns) <= interval_ns
 
     def answered(self, stamp_ns: int) -> None:
         """Record that the frame with this stamp, and all frames before it, are processed."""
@@ -179,6 +181,3 @@ class Backlog:
         self._num_unpaired = self.num_unpaired
         self._unanswered.clear()
         self._depths_ns.clear()
-
-    def _pairs(self, color_ns: int, depth_ns: int) -> bool:
-        return abs(color_ns - depth_ns) <= self._interval.ns

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +11,8 @@ import pytest
 
 from splatam_core.cli import main
 from splatam_core.config import flat_values
-from splatam_core.evaluation.ablations import FULL, variant_names, variants
+from splatam_core.errors import RunFolderError
+from splatam_core.evaluation.ablations import FULL, provenance, table, variant_names, variants
 
 SMALL = ['synthetic', '--width', '48', '--max-frames', '3', '--set', 'threads=1', '--set', 'tracking.iterations=2',
          '--set', 'mapping.iterations=2']  # fmt: skip
@@ -64,3 +66,21 @@ def test_a_set_is_run_once_and_printed(tmp_path: Path, capfd: pytest.CaptureFixt
 def test_an_unknown_ablation_lists_the_known(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['ablations', *SMALL, '--only', 'no_luck', '--out', 'never']) == 2
     assert "unknown ablation 'no_luck'; shipped: full, " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('text', ['', '[' * 100_000, 'null', '{"machine": 3}', '\0', None])
+def test_damaged_files_of_a_finished_run_are_one_line(tmp_path: Path, text: str | None) -> None:
+    """They used to be read without the checks of other files: a pipe was waited for, deep nesting was a traceback."""
+    for name in ('run.json', 'metrics.json', 'config.yaml', 'trajectory.txt'):
+        (tmp_path / name).write_text('' if text is None else text)
+    if text is None:
+        (tmp_path / 'metrics.json').unlink()
+        os.mkfifo(tmp_path / 'metrics.json')
+    else:
+        with pytest.raises(RunFolderError, match=r'metrics\.json:? cannot be read'):
+            table({'full': tmp_path})
+    with pytest.raises(RunFolderError, match='cannot be read') as caught:
+        provenance([tmp_path])
+    assert '\n' not in str(caught.value)
+    if text is None:
+        assert '| full | – |' in table({'full': tmp_path})

@@ -69,8 +69,32 @@ def test_associate_limit_is_inclusive(interval, pairs):
 
 
 def test_nothing_pairs(tmp_path):
-    with pytest.raises(DatasetError, match='none of 1 colour and 1 depth images are within 20 ms'):
+    with pytest.raises(DatasetError, match='none of 1 colour and 1 depth images are within 20 ms.*--max-interval 1.001 pairs them'):
         tum.read(write_tum(tmp_path, [1.0], [2.0]))
+    with pytest.raises(DatasetError, match='are their clocks the same'):
+        tum.read(write_tum(tmp_path / 'other', [1.0], [200.0]))
+
+
+@pytest.mark.parametrize(('period_s', 'late_s'), [(0.066, 0.032), (0.2, 0.045)])
+def test_depth_that_is_late_is_paired_by_the_rate(tmp_path, period_s, late_s):
+    stamps = [1.0 + period_s * i for i in range(4)]
+    assert len(tum.read(write_tum(tmp_path, stamps, [stamp + late_s for stamp in stamps]))) == 4
+
+
+def test_an_interval_can_be_stated(tmp_path, caplog):
+    """It used to be refused: 'colour and depth are not paired by stamps'."""
+    folder = write_tum(tmp_path, [1.0, 1.4, 1.8], [1.06, 1.45, 1.84])
+    with pytest.raises(DatasetError, match=r'\+0.050 s from its colour \(median\): --max-interval 0.051 pairs them'):
+        open_sequence(str(folder), max_interval_s=0.03)
+    assert len(open_sequence(str(folder), max_interval_s=0.051)) == 2
+    lines = zip((folder / 'rgb.txt').read_text().splitlines(), (folder / 'depth.txt').read_text().splitlines(), strict=True)
+    (folder / 'associations.txt').write_text('\n'.join(f'{rgb} {depth}' for rgb, depth in lines))
+    for name in ('rgb.txt', 'depth.txt'):
+        (folder / name).unlink()
+    assert len(open_sequence(str(folder))) == 3  # pairs that somebody states
+    assert len(open_sequence(str(folder), max_interval_s=0.051)) == 2 and '1 of 3 pairs are more than 51 ms apart' in caplog.text
+    with pytest.raises(DatasetError, match='3 of 3 pairs are more than 30 ms apart; the nearest depth is'):
+        open_sequence(str(folder), max_interval_s=0.03)
 
 
 @pytest.mark.parametrize(

@@ -116,6 +116,19 @@ def test_capacity_is_two_fifths_more_than_was_needed_and_follows_one_view_later(
     assert steady[0] == 140_000 and steady[-1] < 31_000  # memory is given back in time
 
 
+def test_a_view_of_too_many_entries_is_refused_in_one_line() -> None:
+    """The lists used to take as much memory as they liked."""
+    capacity = Capacity()
+    for gaussians in (1000, 1000):  # the first view, and every one after it until there are fewer entries
+        with pytest.raises(RasterizerError, match='cover 67108865 tiles of the image, and at most 67108864 can be drawn'):
+            capacity.of(torch.tensor([2**26 + 1]), gaussians, 100)
+    assert capacity.of(torch.tensor([10_000]), 1000, 100) == 14_000  # it goes on
+    capacity.of(torch.tensor([2**27]), 1001, 100)  # of a little larger map the number is known one view later
+    with pytest.raises(RasterizerError, match='134217728 tiles'):
+        capacity.of(torch.tensor([10_000]), 1001, 100)
+    assert capacity.of(torch.tensor([10_000]), 1001, 100) == 14_000
+
+
 @pytest.mark.parametrize('tile', [8, 32])
 def test_the_size_of_tiles_changes_nothing(tile: int) -> None:
     image, gradients = scenes.render_with_gradients(TritonRasterizer(), SCENE, torch.float32, _weights(SCENE), DEVICE)

@@ -335,6 +335,23 @@ def test_a_torn_last_line_is_left_out_and_said(tmp_path: Path, torn: str, caplog
     )
 
 
+@pytest.mark.parametrize('longer', ['trajectory.txt', 'frames.csv'])
+@pytest.mark.parametrize('count', [0, 2])
+def test_a_frame_that_only_one_file_has_is_left_out_and_said(
+    tmp_path: Path, longer: str, count: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A writer that is killed between the two lines of a frame used to leave a run whose counts differ."""
+    written(RunFolder.create(tmp_path, CONFIG, NODE), *range(count)).close()
+    expected = read_run(tmp_path)
+    shorter = {'trajectory.txt', 'frames.csv'}.difference([longer]).pop()
+    kept = (tmp_path / shorter).read_text()
+    written(RunFolder(tmp_path), count).close()
+    (tmp_path / shorter).write_text(kept)
+    run = read_run(tmp_path)
+    assert run.stamps_ns() == expected.stamps_ns() and run.frames == expected.frames and run.metrics() == expected.metrics()
+    assert 'the last 1 frames are in one of trajectory.txt and frames.csv only, and left out' in caplog.text
+
+
 def test_a_line_that_is_torn_in_the_middle_is_one_line(tmp_path: Path) -> None:
     written(RunFolder.create(tmp_path, CONFIG, NODE), 0, 1).close()
     with (tmp_path / 'trajectory.txt').open('a') as file:
@@ -457,6 +474,19 @@ def test_a_run_begun_anew_keeps_the_one_before(tmp_path: Path) -> None:
     assert (len(read_run(tmp_path / 'previous').trajectory), len(read_run(tmp_path).trajectory)) == (1, 3)
     RunFolder.create(tmp_path, CONFIG, NODE, overwrite=True).close()  # all its files belong to a run
     assert not (tmp_path / 'previous').exists()
+
+
+def test_a_disk_that_is_full_when_a_run_begins_anew_changes_nothing(tmp_path: Path) -> None:
+    """The files used to be closed, and nothing could be recorded any more."""
+    folder = written(RunFolder.create(tmp_path, CONFIG, NODE), 0, 1)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with full_disk(), pytest.raises(RunFolderError, match='a new run cannot begin: File too large'):
+        folder.restarted(CONFIG)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == before
+    folder = written(written(folder, 2).restarted(CONFIG), 3)
+    folder.close()
+    assert [len(read_run(path).frames) for path in (tmp_path / 'previous', tmp_path)] == [3, 1]
+    assert not list(tmp_path.rglob('.*'))
 
 
 def test_a_run_goes_on_in_another_folder_with_all_that_was_written(tmp_path: Path) -> None:

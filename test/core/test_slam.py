@@ -18,7 +18,7 @@ from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.images.view import View
 from splatam_core.mapping.keyframes import draw
 from splatam_core.mapping.posed import PosedView
-from splatam_core.rasterizer import Render, make_rasterizer
+from splatam_core.rasterizer import Gaussians, Render, make_rasterizer
 from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.slam import Slam
 from splatam_core.tracking import make_tracker
@@ -574,3 +574,60 @@ def test_a_map_does_not_start_on_a_held_out_frame(room: tuple[list[RgbdFrame], l
 def test_holding_out_everything_is_refused() -> None:
     with pytest.raises(ConfigError, match='at least 2'):
         load_config('quick', ['mapping.hold_out=1'])
+
+
+# --- a long frame ---
+
+
+def test_a_long_frame_is_given_up_or_ends_early(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """Tracking gives the frame up, mapping takes no further step; before, a node told to stop waited for both to end."""
+    frames, asked = room[0], [0]
+    after = [10**9]
+
+    def stop() -> bool:
+        asked[0] += 1
+        return asked[0] > after[0]
+
+    config = load_config('splatam', ['threads=1', 'tracking.iterations=30', 'mapping.iterations=20'])
+    slam = Slam(config, stop=stop)
+    assert slam.process(frames[0]).status is Status.INITIALIZED
+    after[0] = asked[0] + 10
+    with pytest.raises(FrameError, match='its tracking was interrupted'):
+        slam.process(frames[1])
+    after[0] = asked[0] + 31 + 10  # ten steps into mapping
+    before = asked[0]
+    assert slam.process(frames[2]).T_world_cam is not None
+    assert asked[0] - before == 31 + 11
+
+
+# --- a map that would fill the memory ---
+
+
+def test_beyond_the_largest_number_the_gaussians_farthest_from_the_camera_go(
+    room: tuple[list[RgbdFrame], list[np.ndarray]], caplog: pytest.LogCaptureFixture
+) -> None:
+    """The way here, a kilometre of it, is forgotten; the camera is tracked as before."""
+    frames, limit = room[0], 30_000
+    slam, free = _slam(f'mapping.max_gaussians={limit}'), _slam()
+    for each in (slam, free):
+        each.process(frames[0])
+    far = torch.linspace(100.0, 1000.0, limit)
+    seen = slam.num_gaussians
+    slam.map.append(
+        Gaussians(
+            torch.stack([far, torch.zeros(limit), -far], dim=1), torch.zeros(limit, 1), torch.zeros(limit), torch.ones(limit, 3)
+        )
+    )
+    for frame in frames[1:4]:
+        result = slam.process(frame)
+        assert result.status is Status.TRACKED and np.abs(result.T_world_cam - free.process(frame).T_world_cam).max() < 1e-4
+    assert seen <= slam.num_gaussians <= limit
+    assert (slam.map.means[:seen].norm(dim=1) < 10).all()  # what is in view stays
+    assert slam.map.means.norm(dim=1).max() < 1200  # and the farthest are gone; they began at 1414 m
+    assert 'the map has reached mapping.max_gaussians = 30000: the' in caplog.text
+
+
+@pytest.mark.parametrize('preset', ['quick', 'realtime'])
+def test_presets_for_long_runs_bound_the_map(preset: str) -> None:
+    config = load_config(preset)
+    assert 0 < config.mapping.max_gaussians <= 10_000_000 and 0 < config.keyframes.budget <= 500

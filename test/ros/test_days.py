@@ -10,15 +10,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from msg_adapters.synchronizer import RgbdSynchronizer
+from splatam_core.config import KeyframeConfig, load_config
 from splatam_core.errors import FrameError
-from splatam_core.types import FrameResult, StageTimings, Status
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.images.view import View
+from splatam_core.mapping.gaussian_map import GaussianMap
+from splatam_core.mapping.keyframes import KeyframeStore
+from splatam_core.mapping.posed import PosedView
+from splatam_core.tracking.motion import MotionModel
+from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status
 from splatam_ros.frames.buffer import MAX_FRAMES, MAX_POSES, TransformBuffer, TransformError
 from splatam_ros.node.diagnostics import FrameCounters
 from splatam_ros.node.gate import FrameGate
 from splatam_ros.node.outputs import PathHistory
+from splatam_ros.node.run_recorder import MAX_WAITING_FRAMES, Waiting
 from splatam_ros.node.stamp_filter import StampFilter
+from splatam_ros.player.pacing import Backlog, Lateness
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 FRAMES = 1_000_000
@@ -51,7 +61,7 @@ def children(item: Any) -> Iterable[object]:
 
 
 class Node:
-    """Everything in the node that sees each frame, without SLAM and without ROS."""
+    """Everything in the node that sees each frame, without the map, the files and ROS; tests of their own bound these."""
 
     def __init__(self) -> None:
         self.synchronizer = RgbdSynchronizer('approximate')
@@ -60,6 +70,7 @@ class Node:
         self.gate = FrameGate(20.0)
         self.counters = FrameCounters()
         self.path = PathHistory(2000)
+        self.motion = MotionModel(constant_velocity=True)
 
     def show(self, number: int) -> None:
         """A frame of a million: some have wrong stamps, miss an image, are lost, refused or fail."""
@@ -84,6 +95,8 @@ class Node:
         status = Status.LOST if number % 17 == 0 else Status.TRACKED
         self.counters.add(FrameResult(number, stamp_ns, status, None, False, 9, 1.0, 1.0, '', StageTimings()), 'camera')
         self.path.append((stamp_ns, 0.0))
+        if number % 100 == 3:  # each takes as long as the rest of the bookkeeping for a hundred frames
+            self.motion.observe(stamp_ns, self.motion.predict(stamp_ns))
 
 
 @pytest.mark.slow
@@ -114,3 +127,44 @@ def test_transforms_of_others_are_bounded() -> None:
     buffer.set_static('base', 'static_0', T)
     with pytest.raises(TransformError, match='static frames are known already'):
         buffer.set_static('base', 'one_too_many', T)
+
+
+def test_what_the_player_remembers_is_bounded() -> None:
+    backlog, lateness = Backlog(needs_depth=True), Lateness()
+    sizes = []
+    count = Lateness.KEPT + 50_000
+    for number in range(count):
+        stamp_ns = 10**18 + number * PERIOD_NS
+        backlog.color(stamp_ns)
+        if number % 10:  # one in ten has no depth, and is no frame
+            backlog.depth(stamp_ns + 10**6)
+        if number % 3 == 2:
+            backlog.answered(stamp_ns - 2 * PERIOD_NS)
+        lateness.add(number % 7 / 1000)
+        if number in (Lateness.KEPT, count - 1):
+            sizes.append(size([backlog, lateness]))
+    assert backlog.num_colors == count and backlog.num_unpaired > 0 and lateness.p95_ms == 6.0
+    assert sizes[1] < sizes[0] + 100_000, sizes
+
+
+def test_keyframes_of_a_long_way_are_bounded() -> None:
+    """Places that are never seen again: the whole way stays covered, more thinly."""
+    store, view = KeyframeStore(torch.device('cpu'), KeyframeConfig(budget=50)), View.__new__(View)
+    object.__setattr__(view, 'depth', torch.ones(1, 1))
+    for number in range(2000):
+        T_cam_world = torch.eye(4)
+        T_cam_world[2, 3] = -0.02 * number
+        store.append(PosedView(view, T_cam_world))
+    way_m = [-float(keyframe.T_cam_world[2, 3]) for keyframe in store]
+    assert len(store) == 50 and way_m[0] == 0 and way_m[-1] == pytest.approx(0.02 * 1999)
+    assert max(np.diff(way_m)) < 0.02 * 2000 / 50 * 4  # no gap of more than a few times the mean
+
+
+def test_what_waits_for_a_full_disk_is_bounded() -> None:
+    waiting = Waiting(load_config('quick'), GaussianMap(), is_saved=False)
+    camera = PinholeCamera(64, 48, 55.0, 55.0, 31.5, 23.5)
+    frame = RgbdFrame(10**18, np.zeros((48, 64, 3), np.uint8), np.ones((48, 64), np.float32), camera)
+    result = FrameResult(0, 10**18, Status.LOST, None, False, 9, 1.0, 1.0, '', StageTimings())
+    kept = [waiting.add(frame, result) for _ in range(MAX_WAITING_FRAMES + 10)]
+    assert sum(kept) == len(waiting.frames) == MAX_WAITING_FRAMES and not any(kept[MAX_WAITING_FRAMES:])
+    assert waiting.frames[0][0].rgb.nbytes == 3 and waiting.frames[0][0].camera == camera  # the images do not wait

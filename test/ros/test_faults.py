@@ -310,6 +310,23 @@ def test_a_disk_that_is_full_at_the_first_frame(graph: Graph, frames: SyntheticS
     assert run.camera == frames[0].camera and len(run.trajectory) == len(run.frames) == 3
 
 
+def test_a_disk_that_is_full_at_a_reset(graph: Graph, frames: SyntheticSequence) -> None:
+    """The old map and the frames since wait in memory; with space again nothing is missing."""
+    out = graph.folder / 'run'
+    live = Live(graph, save_path=out, queue_policy='all')
+    control = Control(graph)
+    assert live.show(still(frames, 0)) and live.show(still(frames, 1))
+    limit_file_size(live.node, 50)
+    assert 'previous' not in control.succeed('reset')
+    assert live.show(still(frames, 2)) and live.show(still(frames, 3)) and live.show(still(frames, 4))
+    assert 'waits for room' in control.fail('save_map')
+    limit_file_size(live.node, resource.RLIM_INFINITY)
+    assert '3 frames' in control.succeed('save_map')
+    before, now = read_run(out / 'previous'), read_run(out)
+    assert len(before.frames) == 2 and len(now.frames) == len(now.trajectory) == 3 and now.camera == before.camera
+    assert before.read_map().means.any() and now.read_map().means.any()
+
+
 SLOW_DISK = """
 import os, sys, time
 from pathlib import Path

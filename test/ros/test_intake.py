@@ -226,6 +226,23 @@ def test_colour_and_depth_that_are_far_apart_are_told_with_the_gap(make_bench: C
     assert 'depth is -0.045 s from its colour' in bench.said()
 
 
+def test_images_that_nobody_stamped_are_told_and_can_be_stamped_when_received(make_bench: Callable[..., Bench]) -> None:
+    bench = make_bench()
+    assert [len(bench.feed(0)) for _ in range(4)] == [1, 0, 0, 0]
+    bench.assembler.report_drops()
+    assert 'all stamps are equal: the driver does not stamp; use_receive_time takes the time of receiving instead' in bench.said()
+    bench = make_bench(use_receive_time=True)
+    frames = [frame for _ in range(3) for frame in bench.feed(0)] + bench.assembler.flush()
+    assert len(frames) == 3 and 0 < frames[0].stamp_ns < frames[1].stamp_ns < frames[2].stamp_ns
+
+
+def test_a_frame_that_cannot_be_used_is_answered(make_bench: Callable[..., Bench]) -> None:
+    """A player used to wait for it until its time-out."""
+    bench = make_bench()
+    assert bench.feed(SECOND) and not bench.feed(2 * SECOND, rgb=RGB[:, :-1]) and bench.feed(3 * SECOND)
+    assert bench.rejected == [2 * SECOND]
+
+
 def test_images_of_different_frames_are_told(make_bench: Callable[..., Bench]) -> None:
     bench = make_bench()
     assert bench.feed(SECOND) and 'registered' not in bench.said()

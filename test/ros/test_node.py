@@ -376,6 +376,36 @@ def test_a_node_told_to_stop_drops_what_it_has_no_time_for(graph: Graph, frames:
     assert len(read_ply(out / 'map.ply').means) > 500
 
 
+SAYS_WHEN_IT_TRACKS = """
+import sys
+from splatam_core.tracking.render_and_compare import RenderAndCompareTracker
+works = RenderAndCompareTracker.track
+def track(*arguments):
+    print('tracking begins', flush=True)
+    return works(*arguments)
+RenderAndCompareTracker.track = track
+from splatam_ros.node.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_node_told_to_stop_gives_up_a_long_frame(graph: Graph, frames: SyntheticSequence) -> None:
+    """Its tracking would take a minute. The frames before it are saved."""
+    out = graph.folder / 'run'
+    camera, done = Camera(graph), graph.collect(Header, '/splatam/processed')
+    endless = {'slam__tracking__iterations': 10_000, 'slam__mapping__iterations': 1, 'slam__threads': 1}
+    node = graph.start('-c', SAYS_WHEN_IT_TRACKS, *node_arguments(preset='splatam', save_path=out, **endless))
+    camera.wait_matched()
+    camera.send(still(frames, 0))
+    graph.spin_until(lambda: done, explain=lambda: node.text)
+    camera.send(still(frames, 1))
+    node.wait_says('tracking begins')
+    node.send(signal.SIGINT)
+    assert node.wait() == 0, node.text
+    assert node.says('WARN', 'skipped: its tracking was interrupted, because there is no time left')
+    assert len(read_run(out).frames) == 1 and len(read_ply(out / 'map.ply').means) > 100
+
+
 def test_a_folder_that_vanishes_is_one_error_at_the_end(graph: Graph, frames: SyntheticSequence) -> None:
     out = graph.folder / 'run'
     camera, done = Camera(graph), graph.collect(Header, '/splatam/processed')

@@ -17,7 +17,7 @@ from msg_adapters.stamps import serialized_stamp_ns
 from msg_adapters.synchronizer import RgbdSet, RgbdSynchronizer
 from splatam_core.datasets.bag.recording import RawMessage, Recording
 from splatam_core.datasets.bag.topics import ChosenTopics
-from splatam_core.datasets.base import MAX_INTERVAL_S, check_increasing
+from splatam_core.datasets.base import check_increasing, nearest_depth
 from splatam_core.errors import CameraError, DatasetError
 from splatam_core.geometry.camera import CameraCalibration
 from splatam_core.geometry.trajectory import Trajectory, stamp_text
@@ -124,18 +124,10 @@ class BagIndex:
     def _nearest(self) -> str:
         """Returns how far depth is from colour, for the error message; empty where one of them is missing."""
         color, depth = (
-            np.sort(np.array([entry.stamp_ns for entry in self.entries if entry.topic == topic and entry.stamp_ns is not None]))
+            np.array([entry.stamp_ns for entry in self.entries if entry.topic == topic and entry.stamp_ns is not None], np.int64)
             for topic in (self.topics.rgb, self.topics.depth)
         )
-        if not (color.size and depth.size):
-            return ''
-        after = np.searchsorted(depth, color).clip(0, len(depth) - 1)
-        before = (after - 1).clip(0)
-        to_after, to_before = depth[after] - color, depth[before] - color
-        gap_s = float(np.median(np.where(np.abs(to_after) < np.abs(to_before), to_after, to_before))) / 1e9
-        needed_s = np.ceil(abs(gap_s) * 1e3 + 1) / 1e3
-        way_out = f'--max-interval {needed_s:g} pairs them' if needed_s <= MAX_INTERVAL_S else 'are their clocks the same?'
-        return f'; the nearest depth is {gap_s:+.3f} s from its colour (median): {way_out}'
+        return nearest_depth(color, depth)
 
 
 @dataclass(slots=True)
@@ -257,8 +249,7 @@ def _check_stamps(recording: Recording, topic: str, stamps_ns: Sequence[int | No
     known = [stamp for stamp in stamps_ns if stamp is not None]
     if len(known) >= MIN_STAMPS and len(set(known)) == 1:
         raise DatasetError(
-            f'{recording.path}: all {len(known)} stamps on {topic} are equal ({stamp_text(known[0])} s): the driver does not '
-            'stamp; --use-receive-time takes the times of recording instead'
+            f'{recording.path}: all {len(known)} stamps on {topic} are equal ({stamp_text(known[0])} s): {remarks.NOT_STAMPED}'
         )
 
 

@@ -16,7 +16,6 @@ from rosbags.interfaces import Connection
 
 from splatam_core.datasets.bag import realsense
 from splatam_core.datasets.bag.qos import OfferedQos
-from splatam_core.datasets.bag.ros1 import ROS1_SUFFIX
 from splatam_core.datasets.bag.storage import Storage, open_storage, read_errors
 from splatam_core.datasets.bag.typestore import FLOAT32, IMAGE, IMAGES, deserialize
 from splatam_core.errors import DatasetError
@@ -124,7 +123,7 @@ class Recording:
         Raises:
             DatasetError: there are none.
         """
-        if self._is_damaged or self.path.suffix == ROS1_SUFFIX:
+        if self._is_damaged:
             return False
         self._is_damaged = True
         _close_all(self._idle)

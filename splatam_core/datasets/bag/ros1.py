@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag1
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from splatam_core.datasets.bag.cut_ros1 import CutRosbag1
 from splatam_core.datasets.bag.qos import OfferedQos, offered_qos
 
 ROS1_SUFFIX = '.bag'
@@ -21,14 +23,30 @@ HEADER = 'std_msgs/msg/Header'
 class Rosbag1:
     """A ROS 1 bag as a ``Storage``. Fields that only one of ROS 1 and ROS 2 has are left out or zero."""
 
-    def __init__(self, path: Path) -> None:
-        self._reader = rosbag1.Reader(path)
-        self._reader.open()
+    def __init__(self, path: Path, *, is_damaged: bool = False) -> None:
+        """Open the file.
+
+        Args:
+            path: the bag.
+            is_damaged: True to search it for messages that are whole, which takes longer. This is done, too, if it has no index.
+        """
+        self.notes: list[str] = []
+        self._reader = self._open(path, is_damaged)
         self.connections: Sequence[Connection] = self._reader.connections
         self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time - 1
         self._ros2 = get_typestore(Stores.ROS2_JAZZY)
-        self.notes: list[str] = []
         self._converters: dict[int, _Converter] = {}
+
+    def _open(self, path: Path, is_damaged: bool) -> rosbag1.Reader:
+        if not is_damaged:
+            whole = rosbag1.Reader(path)
+            with suppress(Exception):  # the library raises a dozen types on damaged files
+                whole.open()
+                return whole
+        cut = CutRosbag1(path)
+        cut.open()
+        self.notes.append(cut.missing)
+        return cut
 
     def type_name(self, connection: Connection) -> str:
         """See ``Storage``."""

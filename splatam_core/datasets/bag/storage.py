@@ -62,7 +62,7 @@ def open_storage(path: Path, *, is_damaged: bool = False) -> Storage:
 
     Args:
         path: the bag.
-        is_damaged: True to search the files of a rosbag2 for messages that are whole.
+        is_damaged: True to search the files for messages that are whole.
 
     Raises:
         DatasetError: there is no such bag, or it cannot be read.
@@ -70,7 +70,7 @@ def open_storage(path: Path, *, is_damaged: bool = False) -> Storage:
     if not path.exists():
         raise DatasetError(f'{path}: there is no such file or folder')
     with read_errors(path):
-        return Rosbag1(path) if path.suffix == ROS1_SUFFIX else Rosbag2(path, is_damaged=is_damaged)
+        return Rosbag1(path, is_damaged=is_damaged) if path.suffix == ROS1_SUFFIX else Rosbag2(path, is_damaged=is_damaged)
 
 
 def is_bag(path: Path) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,14 +13,10 @@ from torch import Tensor
 
 from splatam_core.config import MappingConfig
 from splatam_core.images.filters import is_on_host
+from splatam_core.interruption import Stop, never
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.posed import PosedView
 from splatam_core.rasterizer import Rates
-
-
-def never() -> bool:
-    """Never stops."""
-    return False
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +29,7 @@ class TimeLimit:
     """
 
     seconds: float = math.inf
-    stop: Callable[[], bool] = never
+    stop: Stop = never
 
 
 class MapOptimizer(Protocol):

@@ -15,6 +15,8 @@ from splatam_core.rasterizer.triton import kernels
 
 BLOCK = 1024 if kernels.INTERPRETED else 256  # Gaussians per program
 MAX_TILES = 4095  # on a side: 12 bits hold them
+MAX_ENTRIES = 2**26
+"""Pairs of a Gaussian and a tile in a view, as for the native rasterizer; their lists and gradients take 4 GB."""
 _MAX_SHORT = 2**15 - 1
 
 
@@ -66,7 +68,8 @@ class Capacity:
 
     The number of entries is read back one view late, while the device works on. The capacity is 1.4 times the recent maximum.
     The host waits for the number of the first view, and of a view with many more Gaussians or pixels than before. A view that
-    needs more than the capacity is still drawn correctly, but slowly: its tiles visit all Gaussians in depth order.
+    needs more than the capacity is still drawn correctly, but slowly: its tiles visit all Gaussians in depth order. After a
+    view of more than ``MAX_ENTRIES``, the next one is refused.
     """
 
     def __init__(self) -> None:
@@ -82,6 +85,9 @@ class Capacity:
             total: [1] int64, entries of this view, on the device.
             num_gaussians: Gaussians to draw.
             num_tiles: tiles of the image.
+
+        Raises:
+            RasterizerError: the view, or the one before, has too many entries.
         """
         known_gaussians, known_tiles = self._measured
         if num_gaussians > 1.25 * known_gaussians or num_tiles > known_tiles:
@@ -105,6 +111,12 @@ class Capacity:
         return int(total)
 
     def _take(self, entries: int) -> None:
+        if entries > MAX_ENTRIES:
+            self._measured, self._reading = (0, 0), None  # the next view is measured before it is drawn
+            raise RasterizerError(
+                f'the Gaussians cover {entries} tiles of the image, and at most {MAX_ENTRIES} can be drawn: draw smaller images, '
+                'or a map of smaller Gaussians'
+            )
         self._recent_maximum = max(float(entries), 0.99 * self._recent_maximum)
         if not 1.1 * self._recent_maximum < self._capacity_now < 3 * self._recent_maximum:
             self._capacity_now = max(1024, round(1.4 * self._recent_maximum))
@@ -139,7 +151,7 @@ class Lister:
             pose: [4, 4] world to camera, contiguous, on the same device.
 
         Raises:
-            RasterizerError: the image is too large.
+            RasterizerError: the image is too large, or too many Gaussians cover too much of it.
         """
         tiles_x, tiles_y = (-(-size // self._tile) for size in (camera.width, camera.height))
         if max(tiles_x, tiles_y) > MAX_TILES:
