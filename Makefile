@@ -11,16 +11,19 @@ FINDABLE = $(foreach name,python3 python3.12 python3.11 python3.10,$(shell $(nam
 CHECK_PYTHON := import sys; sys.exit(0 if (3, 10) <= sys.version_info < (3, 13) else 1)
 PYTHON ?= $(firstword $(FINDABLE))
 TEST_WORKERS ?= 2
+FUZZ_MINUTES ?= 10
 export SPLATAM_DATA ?= $(abspath ../shared/data)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup test test-quick sanitize sanitize-threads lint format docs hooks tf2_msgs demo paper-tables colcon check-aarch64 clean
+.PHONY: help setup test test-quick fuzz fuzz-long sanitize sanitize-threads lint format docs hooks tf2_msgs demo paper-tables colcon check-aarch64 clean
 
 help:
 	@echo 'make setup           create $(VENV), build the native code and install the package (PYTHON=python3.11 chooses the interpreter)'
 	echo 'make test-quick      run the fast tests: no ROS processes, no recordings, under 2 minutes'
 	echo 'make test            run every test, $(TEST_WORKERS) at a time (TEST_WORKERS=4 changes that)'
-	echo 'make sanitize        run the native code'"'"'s tests with the address and undefined-behaviour sanitizers of g++'
+	echo 'make fuzz            try odd and damaged input of every kind for $(FUZZ_MINUTES) minutes (FUZZ_MINUTES=1 changes that)'
+	echo 'make fuzz-long       the same until every kind has had its number of inputs: hours; continues where it stopped'
+	echo 'make sanitize        run tests and fuzz of the native code with the address and undefined-behaviour sanitizers of g++'
 	echo 'make sanitize-threads run the tests of threads with the thread sanitizer of g++'
 	echo 'make lint            check style, types and spelling: ruff, mypy, codespell, clang-format'
 	echo 'make format          rewrite Python and C++ files in the project'"'"'s format'
@@ -71,17 +74,33 @@ test: setup tf2_msgs
 test-quick: setup
 	@$(BIN)/python -m pytest -q -n $(TEST_WORKERS) --dist worksteal -m 'not slow and not ros and not recording'
 
-# A second build of the native code, in build/sanitize; test/conftest.py loads it in place of the first.
+fuzz: setup
+	@$(BIN)/python test/fuzz/run.py --minutes $(FUZZ_MINUTES)
+
+# Counts are kept in out/fuzz; remove it to begin anew.
+NATIVE_KIND := 'native calls'
+fuzz-long: setup build/sanitize/.built
+	@$(BIN)/python test/fuzz/run.py --long --minutes 6000 --except $(NATIVE_KIND) --counts out/fuzz/counts.json
+	$(WITH_SANITIZERS)
+	$(BIN)/python test/fuzz/run.py --long --minutes 6000 --kind $(NATIVE_KIND) --counts out/fuzz/sanitized.json
+
+# A second build of the native code, in build/sanitize; test/other_native.py loads it in place of the first.
 SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=undefined -fno-omit-frame-pointer -O1 -g
 SANITIZED_TESTS := test/core/test_native_bindings.py test/core/test_rasterizer_contract.py test/core/test_torch_aligner.py \
 	test/core/test_anisotropic.py test/core/test_finite.py test/core/test_map.py
-sanitize: setup
+define WITH_SANITIZERS
+preload=; for library in asan ubsan stdc++; do preload+="$$(g++ -print-file-name=lib$$library.so) "; done; \
+	export ASAN_OPTIONS=detect_leaks=0:handle_abort=1 UBSAN_OPTIONS=print_stacktrace=1 LD_PRELOAD=$$preload \
+	SPLATAM_NATIVE=$$(find build/sanitize -name '_native*.so')
+endef
+build/sanitize/.built: $(CSRC) setup.py | setup
 	@SPLATAM_CXXFLAGS='$(SANITIZERS)' $(BIN)/python setup.py --quiet build_ext --force --build-lib build/sanitize --build-temp build/sanitize/objects
-	preload=
-	for library in asan ubsan stdc++; do preload+="$$(g++ -print-file-name=lib$$library.so) "; done
-	export ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1
-	SPLATAM_NATIVE=$$(find build/sanitize -name '_native*.so') LD_PRELOAD=$$preload \
-		$(BIN)/python -m pytest -q -p no:cacheprovider $(SANITIZED_TESTS)
+	touch $@
+
+sanitize: setup build/sanitize/.built
+	@$(WITH_SANITIZERS)
+	$(BIN)/python -m pytest -q -p no:cacheprovider $(SANITIZED_TESTS)
+	$(BIN)/python test/fuzz/run.py --minutes $(FUZZ_MINUTES) --kind $(NATIVE_KIND) --kind 'odd frames'
 
 # Data races of the native code. Python, torch and numpy are not built with the sanitizer, so only their locks are seen.
 # setarch: the sanitizer of g++ 12 needs addresses that are not randomised.

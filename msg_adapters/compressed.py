@@ -18,7 +18,7 @@ from msg_adapters import rvl, stamps
 from msg_adapters.encodings import Depth, DepthEncoding, Rgb, clean_metres, metres_from_counts
 from msg_adapters.errors import MessageError
 from msg_adapters.factory import MessageFactory
-from msg_adapters.image_headers import JPEG, PNG, Size, stated_size
+from msg_adapters.image_headers import JPEG, PNG, Size, is_cut, stated_size
 from msg_adapters.image_size import check_color_size, check_depth_size
 from msg_adapters.pixels import checked_depth, checked_rgb, millimetres
 
@@ -101,7 +101,7 @@ def _size(data: bytes, image_format: str) -> Size:
 
 
 def _decoded(data: bytes, flags: int, image_format: str) -> NDArray[Any]:
-    if not _is_complete(data):
+    if is_cut(data) or not _is_complete(data):
         raise _damaged(data, image_format)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)

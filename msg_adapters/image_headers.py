@@ -43,6 +43,21 @@ def too_large(size: Size) -> str:
     return f'claims to be {width}x{height} pixels; images of 1 to {MAX_PIXELS} pixels are read'
 
 
+def is_cut(data: bytes) -> bool:
+    """Returns True if a chunk of a PNG ends behind the data; OpenCV allocates what a chunk claims, up to 4 GB.
+
+    Args:
+        data: the whole file; of another format it is never cut.
+    """
+    at, kind = len(PNG), b''
+    while data.startswith(PNG) and kind != b'IEND':
+        length, kind = int.from_bytes(data[at : at + 4], 'big'), data[at + 4 : at + 8]
+        at += 12 + length
+        if at > len(data):
+            return True
+    return False
+
+
 def _stated_size(data: bytes) -> Size | None:
     if data.startswith(PNG):
         return _pair('>II', data, 16)

@@ -1,8 +1,18 @@
 """The errors a user can cause. Anything else that is raised is a bug and keeps its traceback."""
 
+LONGEST = 2500  # characters
+
 
 class SplatamError(Exception):
-    """Base of every error a user can cause: what, the value, what is allowed, what to do."""
+    """Base of every error a user can cause: what, the value, what is allowed, what to do.
+
+    It is one line, whatever texts of files and of other libraries it quotes.
+    """
+
+    def __init__(self, text: str = '') -> None:
+        """Make one printable line of the text; the middle of a very long one is left out."""
+        line = ''.join(character if character.isprintable() else ' ' for character in text)
+        super().__init__(line if len(line) <= LONGEST else f'{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}')
 
 
 class ConfigError(SplatamError):

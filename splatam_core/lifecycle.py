@@ -220,6 +220,7 @@ class SlamLifecycle:
 
     def _admit(self, frame: RgbdFrame) -> CurrentFrame:
         """Checks a frame, numbers it and starts its clock."""
+        _check_images(frame)
         if self.camera is not None and frame.camera != self.camera:
             raise FrameError(f'the camera changed from {self.camera} to {frame.camera}; reset to start a new map')
         if self._last_stamp_ns is not None and frame.stamp_ns <= self._last_stamp_ns:
@@ -262,3 +263,16 @@ def check_truth(config: SlamConfig, true_motion: MotionPrior | None) -> None:
             "tracking.method = truth: there is no ground truth here; only 'splatam run' on a recording that has it can use it. "
             'Choose render_and_compare or align'
         )
+
+
+def _check_images(frame: RgbdFrame) -> None:
+    """Checks that the images are what ``RgbdFrame`` promises.
+
+    Raises:
+        FrameError: one has another size than the camera, or another type.
+    """
+    size = frame.camera.height, frame.camera.width
+    expected = (('rgb', frame.rgb, (*size, 3), np.uint8), ('depth_m', frame.depth_m, size, np.float32))
+    for name, image, shape, dtype in expected:
+        if image.shape != shape or image.dtype != dtype:
+            raise FrameError(f'{name} of the frame is {image.shape} {image.dtype}; expected {shape} {np.dtype(dtype)}')

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import fcntl
-import importlib.util
 import os
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 import torch
+from other_native import use_other_native_build
 
-import splatam_core
 from splatam_core.config import SlamConfig, apply_threads
 from splatam_core.datasets.synthetic import SyntheticSequence
 
@@ -25,21 +23,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
     Without a GPU, Triton interprets its kernels. It reads the variable when the kernels are imported.
     """
-    if path := os.environ.get('SPLATAM_NATIVE'):
-        load_native(Path(path))
+    use_other_native_build()
     os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
     if not torch.cuda.is_available():
         os.environ.setdefault('TRITON_INTERPRET', '1')
     apply_threads(SlamConfig())
-
-
-def load_native(path: Path) -> None:
-    """Uses another build of the native code: that of `make sanitize`."""
-    spec = importlib.util.spec_from_file_location('splatam_core._native', path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    sys.modules['splatam_core._native'] = splatam_core._native = module
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects

@@ -32,7 +32,11 @@ Size size_of(const py::handle& image, const char* name) {
 
 // Intrinsics of a PinholeCamera, and the size of the image it is used for.
 Camera camera_of(const py::object& camera, Size size) {
-  const auto intrinsic = [&](const char* name) { return camera.attr(name).cast<float>(); };
+  const auto intrinsic = [&](const char* name) {
+    if (!py::hasattr(camera, name))
+      throw py::type_error(std::string("camera has no ") + name + "; expected a PinholeCamera");
+    return camera.attr(name).cast<float>();
+  };
   return {int(size.width), int(size.height), intrinsic("fx"), intrinsic("fy"), intrinsic("cx"), intrinsic("cy")};
 }
 

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msg_adapters.image_headers import EXR, stated_size, too_large
+from msg_adapters.image_headers import EXR, is_cut, stated_size, too_large
 from splatam_core.errors import DatasetError, one_line
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
@@ -160,6 +160,8 @@ def _image_bytes(path: Path) -> bytes:
     """Read an image file and check the size that it states, before it is decoded."""
     data = read_bytes(path, DatasetError, MAX_IMAGE_BYTES)
     _checked_size(path, data)
+    if is_cut(data):
+        raise DatasetError(f'{path}: is damaged, or cut off after {len(data)} bytes; is the copy complete?')
     return data
 
 

@@ -39,7 +39,7 @@ class View:
     def from_frame(cls, frame: RgbdFrame, config: DepthConfig) -> View:
         """Returns the frame's images in the host's memory, with the depth readings that are used (see ``usable_depth``)."""
         depth_m = usable_depth(frame.depth_m, config)
-        rgb8 = torch.from_numpy(np.ascontiguousarray(frame.rgb))
+        rgb8 = torch.from_numpy(np.require(frame.rgb, requirements=['C', 'W']))  # torch takes no read-only memory
         return cls(frame.camera, rgb8, torch.from_numpy(depth_m), reading_spacing(depth_m))
 
     def to(self, device: torch.device) -> View:

@@ -85,6 +85,8 @@ def _connections(database: sqlite3.Connection, counts: Mapping[int, int]) -> Ite
     columns = [description[0] for description in cursor.description]
     for values in cursor:
         topic = dict(zip(columns, values, strict=True))
+        if not (isinstance(topic['name'], str) and isinstance(topic['type'], str)):  # columns hold values of any type
+            continue
         extension = ConnectionExtRosbag2(topic['serialization_format'], recorded_qos(topic.get('offered_qos_profiles')))
         key = topic['id']
         yield Connection(key, topic['name'], topic['type'], _NO_DEFINITION, digest='', msgcount=counts.get(key, 0),

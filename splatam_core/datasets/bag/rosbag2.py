@@ -59,10 +59,17 @@ class WholeFile:
         self._reader.open()
         self.connections: Sequence[Connection] = self._reader.connections
         self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time - 1
+        if type(self.start_ns) is not int or type(self.end_ns) is not int:  # SQLite columns hold values of any type
+            raise ValueError('times of recording are no whole numbers')
+        if not all(isinstance(text, str) for connection in self.connections for text in _key(connection)):
+            raise ValueError('names or types of topics are no texts')
 
     def messages(self, connections: Sequence[Connection], start_ns: int | None, stop_ns: int | None) -> Iterator[Message]:
         """See ``BagFile``."""
-        return self._reader.messages(connections, start_ns, stop_ns)
+        for connection, time_ns, data in self._reader.messages(connections, start_ns, stop_ns):
+            if type(time_ns) is not int or not isinstance(data, (bytes, memoryview)):
+                raise ValueError('a message has no time of recording, or no bytes')
+            yield connection, time_ns, data
 
     def close(self) -> None:
         """See ``BagFile``."""
