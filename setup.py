@@ -32,6 +32,7 @@ COMPILE_FLAGS = [
     '-std=c++17', '-O3', '-g0', '-fno-math-errno', '-fno-trapping-math', '-fvisibility=hidden', '-pthread',
     '-Wno-psabi',
 ]  # fmt: skip
+WITHOUT_NATIVE = os.environ.get('SPLATAM_WITHOUT_NATIVE', '0') not in ('', '0')  # for machines with a GPU: needs no compiler
 MORE_FLAGS = shlex.split(os.environ.get('SPLATAM_CXXFLAGS', ''))  # of the compiler and the linker; `make sanitize` sets them
 
 
@@ -48,7 +49,10 @@ def missing_for_build() -> str | None:
     """Returns one line that says what to install before the extension can be built, or None if nothing is missing."""
     compiler = shlex.split(os.environ.get('CXX') or sysconfig.get_config_var('CXX') or 'g++')[0]
     if shutil.which(compiler) is None:
-        return f"no C++ compiler (looked for '{compiler}'): apt install g++ python3-dev, or set CXX"
+        return (
+            f"no C++ compiler (looked for '{compiler}'): apt install g++ python3-dev, or set CXX; "
+            'with a GPU, SPLATAM_WITHOUT_NATIVE=1 builds without'
+        )
     if not Path(sysconfig.get_path('include'), 'Python.h').is_file():
         return f'no Python.h in {sysconfig.get_path("include")}: apt install g++ python3-dev'
     if pybind11_include_dirs() is None:
@@ -64,7 +68,7 @@ class BuildNative(build_ext):
 
     def run(self) -> None:
         """Build the extension; exit with one line if something is not installed."""
-        if missing := missing_for_build():
+        if self.extensions and (missing := missing_for_build()):
             sys.exit(f'{NAME}: {missing}')
         super().run()
         if not self.inplace and not MORE_FLAGS and platform.machine() in self.plat_name:  # not when cross-compiling
@@ -106,7 +110,7 @@ setup(
     maintainer=PACKAGE_XML.findtext('maintainer'),
     maintainer_email=PACKAGE_XML.find('maintainer').get('email'),
     packages=find_packages(include=[f'{package}{depth}' for package in TOP_LEVEL for depth in ('', '.*')]),
-    ext_modules=[native_extension()],
+    ext_modules=[] if WITHOUT_NATIVE else [native_extension()],
     cmdclass={'build_ext': BuildNative},
     data_files=shared_files(),
     package_data={'splatam_core.evaluation.report': ['*.html']},

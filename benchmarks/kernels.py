@@ -1,6 +1,9 @@
 """Times of the rasterizer's passes, with one Gaussian per pixel as in a new map.
 
-    python benchmarks/kernels.py [--runs 20]
+    python benchmarks/kernels.py [--runs 20] [--compare generic avx2]
+
+With --compare only the passes of these instruction sets are timed, on one thread and in turn, so that other work on the machine
+slows all of them. The ratio to the last one is of the medians.
 
 Forward covers everything from the parameters to the images, including projection, sorting and binning. Backward covers
 everything from the gradients of the images to those of the parameters (map), or of the pose alone (pose).
@@ -16,10 +19,14 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
+import os
 import statistics
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from header import print_header, timed_ms
 
@@ -31,6 +38,7 @@ from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.rasterizer import Gaussians, Rasterizer, Render, Target, make_rasterizer
 from splatam_core.rasterizer.base import BLUR_PX2, MIN_ALPHA
 from splatam_core.rasterizer.cpu import CpuRasterizer
+from splatam_core.rasterizer.native import make_native_aligner
 from splatam_core.tracking import make_tracker
 
 SIZES = ((320, 240), (640, 480))
@@ -182,13 +190,85 @@ def native() -> Iterator[tuple[str, CpuRasterizer, PinholeCamera, int]]:
         yield name, rasterizer, camera(*size), threads
 
 
+@contextmanager
+def instruction_set(name: str) -> Iterator[None]:
+    """Limits what is made in the block to an instruction set."""
+    before = os.environ.get('SPLATAM_ISA')
+    os.environ['SPLATAM_ISA'] = name
+    try:
+        yield
+    finally:
+        os.environ.pop('SPLATAM_ISA')
+        if before is not None:
+            os.environ['SPLATAM_ISA'] = before
+
+
+def passes(name: str, cam: PinholeCamera) -> dict[str, Callable[[], float]]:
+    """Returns functions that run a pass of an instruction set once and return its time in milliseconds."""
+    with instruction_set(name):
+        rasterizer, aligner = CpuRasterizer(1), make_native_aligner(1)
+    if rasterizer.instruction_set != name:
+        raise SystemExit(f'this processor runs {rasterizer.instruction_set}, not {name}')
+    still, config, wall, view = wavy_wall(cam), load_config('realtime'), GaussianMap(), wall_view(cam)
+    wall.append(wavy_wall(cam))
+    moving, pose = with_gradients(still), torch.eye(4)
+    pose[0, 3] = 0.003
+    target = Target(cam, view.rgb8, view.depth, pose, config.mapping.color_weight, config.mapping.depth_weight)
+    brightness, motion = still.rgb.mean(1).view(cam.height, cam.width).numpy(), pose.numpy()
+    layers = aligner.layers(brightness, view.depth.numpy(), 0.05)
+
+    def to_map() -> float:
+        render = rasterizer.render(moving, cam, pose)
+        return once_ms(lambda: backward(render))
+
+    def align() -> object:
+        return aligner.linearize(
+            brightness, view.depth.numpy(), layers, camera=cam, color_motion=motion, depth_motion=motion,
+            velocity=np.zeros(6, np.float32), gain=1.0, bias=0.0, photometric_scale=0.05, depth_scale=0.02, max_depth_ratio=0.1,
+            inlier_color=0.1, inlier_depth=0.05,
+        )  # fmt: skip
+
+    return {
+        'forward': lambda: once_ms(lambda: rasterizer.render(still, cam, pose)),
+        'backward, map': to_map,
+        'fit': lambda: once_ms(lambda: rasterizer.fit(wall.gaussians, wall.moments, optimizers.rates(config.mapping), target)),
+        'align, one iteration': lambda: once_ms(align),
+    }
+
+
+def once_ms(function: Callable[[], object]) -> float:
+    """Returns the wall time of one run, in milliseconds."""
+    start = time.perf_counter()
+    function()
+    return 1e3 * (time.perf_counter() - start)
+
+
+def compare(names: list[str], runs: int) -> None:
+    """Print the times of several instruction sets, and their ratio to those of the last one."""
+    print('| pass | image | ' + ' | '.join(f'{name} ms' for name in names) + f' | times {names[-1]} |')
+    print('|' + '---|' * (len(names) + 3))
+    for size in SIZES:
+        sets = [passes(name, camera(*size)) for name in names]
+        for name in sets[0]:
+            times = [[one[name]() for one in sets] for _ in range(runs + 1)][1:]  # the first is a warm-up
+            medians = [statistics.median(column) for column in zip(*times, strict=True)]
+            cells = ' | '.join(f'{median:.2f}' for median in medians)
+            ratios = ', '.join(f'{median / medians[-1]:.2f}' for median in medians[:-1])
+            print(f'| {name} | {size[0]}x{size[1]} | {cells} | {ratios} |', flush=True)
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--runs', type=int, default=20)
-    runs = parser.parse_args().runs
+    parser.add_argument('--compare', nargs='+', metavar='ISA', help='generic, avx2, avx512: compare these')
+    options = parser.parse_args()
+    runs = options.runs
     torch.set_num_threads(1)
     print_header('Rasterizer kernels', runs)
+    if options.compare:
+        compare(options.compare, runs)
+        return
     print('| backend | image | forward ms | backward, map ms | backward, pose ms | forward + backward, map ms |')
     print('|---|---|---|---|---|---|')
     for name, rasterizer, cam, _ in native():

@@ -122,8 +122,30 @@ def test_a_missing_compiler_is_one_line(tmp_path: Path) -> None:
     built = run_setup('build_ext', '--build-lib', str(tmp_path), '--build-temp', str(tmp_path), CXX='no-such-compiler')
     assert built.returncode == 1
     assert built.stderr.splitlines() == [
-        "splatam_ros: no C++ compiler (looked for 'no-such-compiler'): apt install g++ python3-dev, or set CXX"
+        "splatam_ros: no C++ compiler (looked for 'no-such-compiler'): apt install g++ python3-dev, or set CXX; with a GPU, "
+        'SPLATAM_WITHOUT_NATIVE=1 builds without'
     ]
+
+
+def test_an_installation_for_the_gpu_needs_no_compiler(tmp_path: Path) -> None:
+    """Everything but the native module is there, and only what needs that module says so."""
+    built = run_setup(
+        'build', '--build-base', str(tmp_path / 'build'), '--build-lib', str(tmp_path / 'lib'),
+        CXX='no-such-compiler', CC='no-such-compiler', SPLATAM_WITHOUT_NATIVE='1',
+    )  # fmt: skip
+    assert built.returncode == 0, built.stderr
+    assert not list(tmp_path.rglob('*.so'))
+    code = (
+        'import sys; sys.meta_path = [finder for finder in sys.meta_path if "editable" not in str(finder.__module__)]\n'
+        'import splatam_core.slam, splatam_core.errors as errors; from splatam_core.rasterizer import make_rasterizer\n'
+        'print(splatam_core.__file__); make_rasterizer("reference")\n'
+        'try: make_rasterizer("cpu", 1)\n'
+        'except errors.RasterizerError as error: print(error)'
+    )
+    environment = {**os.environ, 'PYTHONPATH': str(tmp_path / 'lib')}
+    done = subprocess.run([sys.executable, '-c', code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    where, refused = done.stdout.splitlines()
+    assert where.startswith(str(tmp_path)) and 'native module' in refused, done.stderr
 
 
 @pytest.mark.parametrize('program', ['node', 'player'])

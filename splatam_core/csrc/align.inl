@@ -1,42 +1,12 @@
 // Direct alignment: each point of a reference image is moved and projected into a frame. Its brightness and depth are
 // compared with those of the frame there. Included after lanes.inl.
 
-// Transposes in place: lane k of rows[i] becomes lane i of rows[k].
-static inline void transpose(Lanes* rows) {
-  Lanes a[8], b[8];
-  for (int i = 0; i < 8; i += 2) {
-    a[i] = __builtin_shufflevector(rows[i], rows[i + 1], 0, 8, 2, 10, 4, 12, 6, 14);
-    a[i + 1] = __builtin_shufflevector(rows[i], rows[i + 1], 1, 9, 3, 11, 5, 13, 7, 15);
-  }
-  for (int i = 0; i < 8; i += 4)
-    for (int k = 0; k < 2; ++k) {
-      b[i + k] = __builtin_shufflevector(a[i + k], a[i + k + 2], 0, 1, 8, 9, 4, 5, 12, 13);
-      b[i + k + 2] = __builtin_shufflevector(a[i + k], a[i + k + 2], 2, 3, 10, 11, 6, 7, 14, 15);
-    }
-  for (int k = 0; k < 4; ++k) {
-    rows[k] = __builtin_shufflevector(b[k], b[k + 4], 0, 1, 2, 3, 8, 9, 10, 11);
-    rows[k + 4] = __builtin_shufflevector(b[k], b[k + 4], 4, 5, 6, 7, 12, 13, 14, 15);
-  }
-}
-
-static inline Lanes absolute(Lanes x) { return x < 0.0f ? -x : x; }
-
-static inline double sum(Lanes x) {
-  double total = 0.0;
-  for (int i = 0; i < 8; ++i) total += x[i];
-  return total;
-}
-
-static inline int count(IntLanes mask) {
-  int total = 0;
-  for (int i = 0; i < 8; ++i) total -= mask[i];
-  return total;
-}
-
 static inline void tally(std::uint32_t* bins, Lanes residuals, IntLanes seen) {
-  const IntLanes index = (((IntLanes)absolute(residuals)) >> 20) - ((127 - 64) << 3);
+  std::int32_t index[8];
+  store(index, (bits(absolute(residuals)) >> 20) - ((127 - 64) << 3));
+  const unsigned is_seen = bits_of_mask(seen);
   for (int i = 0; i < 8; ++i)
-    if (seen[i]) ++bins[index[i] < 0 ? 0 : index[i] >= kResidualBins ? kResidualBins - 1 : index[i]];
+    if (is_seen >> i & 1) ++bins[index[i] < 0 ? 0 : index[i] >= kResidualBins ? kResidualBins - 1 : index[i]];
 }
 
 // Student's t with five degrees of freedom, as in Kerl et al. 2013.
@@ -44,19 +14,23 @@ static inline Lanes robust_weight(Lanes squared) { return 6.0f / (5.0f + squared
 
 // Samples the layers of the frame bilinearly at eight positions: sampled[k] holds layer k, one lane per position.
 static inline void sample(const float* layers, int width, Lanes u, Lanes v, IntLanes inside, Lanes* sampled) {
-  const IntLanes column = __builtin_convertvector(keep(inside, u), IntLanes);
-  const IntLanes row = __builtin_convertvector(keep(inside, v), IntLanes);
-  const Lanes right = u - __builtin_convertvector(column, Lanes), below = v - __builtin_convertvector(row, Lanes);
+  const IntLanes column = truncated(keep(inside, u)), row = truncated(keep(inside, v));
+  const Lanes to_right = u - to_float(column), to_below = v - to_float(row);
+  std::int32_t columns[8], rows[8];
+  float right[8], left[8], below[8], above[8];
+  store(columns, column), store(rows, row);
+  store(right, to_right), store(left, 1.0f - to_right), store(below, to_below), store(above, 1.0f - to_below);
+  const unsigned is_inside = bits_of_mask(inside);
   for (int i = 0; i < 8; ++i) {
-    if (!inside[i]) {
+    if (!(is_inside >> i & 1)) {
       sampled[i] = Lanes{};
       continue;
     }
-    const float* at = layers + (std::size_t(row[i]) * width + column[i]) * kLayers;
+    const float* at = layers + (std::size_t(rows[i]) * width + columns[i]) * kLayers;
     const float* under = at + std::size_t(width) * kLayers;
-    const Lanes upper = load(at) * (1.0f - right[i]) + load(at + kLayers) * right[i];
-    const Lanes lower = load(under) * (1.0f - right[i]) + load(under + kLayers) * right[i];
-    sampled[i] = upper * (1.0f - below[i]) + lower * below[i];
+    const Lanes upper = load(at) * left[i] + load(at + kLayers) * right[i];
+    const Lanes lower = load(under) * left[i] + load(under + kLayers) * right[i];
+    sampled[i] = upper * above[i] + lower * below[i];
   }
   transpose(sampled);
 }
@@ -89,30 +63,45 @@ static inline Moved moved(const Pose& motion, Lanes px, Lanes py, Lanes pz, IntL
   return p;
 }
 
+// The sums over a row, one lane per pixel modulo eight.
+struct RowSums {
+  Lanes H[kUnknowns * (kUnknowns + 1) / 2], g[kUnknowns], cost;
+  IntLanes points, compared, seen, agreeing;  // negative
+};
+
+// Not inlined: it runs once per row, and would take registers from the pixels' loop.
+__attribute__((noinline)) static void add(AlignmentSums& sums, const RowSums& row) {
+  for (int i = 0; i < kUnknowns * (kUnknowns + 1) / 2; ++i) sums.H[i] += sum(row.H[i]);
+  for (int i = 0; i < kUnknowns; ++i) sums.g[i] += sum(row.g[i]);
+  sums.cost += sum(row.cost);
+  sums.points -= sum(row.points), sums.compared -= sum(row.compared);
+  sums.seen -= sum(row.seen), sums.agreeing -= sum(row.agreeing);
+}
+
 static void align(const float* brightness, const float* depth, const Camera& camera, int begin, int end,
                   const float* layers, const Pose& color_motion, const Pose& depth_motion,
                   const AlignmentSettings& settings, AlignmentSums& sums, ResidualHistogram& histogram) {
   const Lanes nan = splat(__builtin_nanf(""));
   const bool is_split = __builtin_memcmp(&color_motion, &depth_motion, sizeof(Pose)) != 0;
+  const Lanes photometric_scale = splat(settings.photometric_scale), depth_scale = splat(settings.depth_scale);
+  const Lanes photometric_precision = 1.0f / (photometric_scale * photometric_scale);
+  const Lanes depth_precision = 1.0f / (depth_scale * depth_scale);
   for (int row = begin; row < end; ++row) {
-    Lanes H[kUnknowns * (kUnknowns + 1) / 2] = {}, g[kUnknowns] = {}, cost{};
-    const float ray_y = (row - camera.cy) / camera.fy;
+    RowSums total{};
+    const Lanes ray_y = (to_float(splat_int(row)) - camera.cy) / camera.fy;
     for (int first = 0; first < camera.width; first += 8) {
       const int columns = camera.width - first < 8 ? camera.width - first : 8;
       const std::size_t at = std::size_t(row) * camera.width + first;
-      Lanes intensity = nan, range = nan;
-      __builtin_memcpy(&intensity, brightness + at, sizeof(float) * columns);
-      __builtin_memcpy(&range, depth + at, sizeof(float) * columns);
+      const Lanes intensity = load_some(brightness + at, columns, nan), range = load_some(depth + at, columns, nan);
       const IntLanes known = range > 0.0f;  // false for NaN
-      const int points = count(known);
-      if (points == 0) continue;
-      sums.points += points;
-      const Lanes px = (iota() + (float(first) - camera.cx)) / camera.fx * range, py = ray_y * range;
+      if (!any(known)) continue;
+      total.points += known;
+      const Lanes px = (iota() + (to_float(splat_int(first)) - camera.cx)) / camera.fx * range, py = ray_y * range;
       const Moved depth_point = moved(depth_motion, px, py, range, known, camera);
       Lanes frame[kLayers];
       sample(layers, camera.width, depth_point.u, depth_point.v, depth_point.inside, frame);
       Lanes depth_residual = (frame[3] - depth_point.z) * depth_point.inverse_z;
-      sums.compared += count(depth_point.inside & (frame[3] == frame[3]));
+      total.compared += depth_point.inside & (frame[3] == frame[3]);
       IntLanes seen = depth_point.inside & (absolute(depth_residual) < settings.max_depth_ratio);  // false for NaN
       // Colour needs the depth of the reference only: a point where the frame has no reading is compared by colour
       // alone.
@@ -132,13 +121,13 @@ static void align(const float* brightness, const float* depth, const Camera& cam
         seen &= color_point.inside, lit &= color_point.inside;
         sample(layers, camera.width, color_point.u, color_point.v, lit, frame);
       }
-      sums.seen += count(seen);
+      total.seen += seen;
       Lanes photometric_residual = keep(lit, frame[0] - (settings.gain * intensity + settings.bias));
       depth_residual = keep(seen, depth_residual * incidence_cosine);
       tally(histogram.photometric, photometric_residual, lit);
       tally(histogram.depth, depth_residual, seen);
-      sums.agreeing += count(seen & (absolute(photometric_residual) <= settings.inlier_color) &
-                             (absolute(depth_residual) <= settings.inlier_depth));
+      total.agreeing += seen & (absolute(photometric_residual) <= settings.inlier_color) &
+                        (absolute(depth_residual) <= settings.inlier_depth);
 
       gradients_by_twist(frame[1] * camera.fx * color_point.inverse_z, frame[2] * camera.fy * color_point.inverse_z,
                          color_point.x, color_point.y, color_point.z, color_point.inverse_z, by_photometric);
@@ -149,30 +138,27 @@ static void align(const float* brightness, const float* depth, const Camera& cam
       for (int i = 0; i < kUnknowns; ++i) by_photometric[i] = keep(lit, by_photometric[i]);
       for (int i = 0; i < 6; ++i) by_depth[i] = keep(seen, by_depth[i] * depth_point.inverse_z * incidence_cosine);
 
-      const float photometric_precision = 1.0f / (settings.photometric_scale * settings.photometric_scale);
-      const float depth_precision = 1.0f / (settings.depth_scale * settings.depth_scale);
       const Lanes photometric_squared = photometric_residual * photometric_residual * photometric_precision;
       const Lanes depth_squared = depth_residual * depth_residual * depth_precision;
       const Lanes photometric_weight = robust_weight(photometric_squared) * photometric_precision;
       const Lanes depth_weight = robust_weight(depth_squared) * depth_precision;
-      cost += keep(seen, photometric_squared / (5.0f + photometric_squared) + depth_squared / (5.0f + depth_squared));
+      total.cost +=
+          keep(seen, photometric_squared / (5.0f + photometric_squared) + depth_squared / (5.0f + depth_squared));
       int entry = 0;
       for (int i = 0; i < kUnknowns; ++i) {
         const Lanes weighted_photometric = by_photometric[i] * photometric_weight;
         if (i < 6) {
           const Lanes weighted_depth = by_depth[i] * depth_weight;
-          g[i] += weighted_photometric * photometric_residual + weighted_depth * depth_residual;
+          total.g[i] += weighted_photometric * photometric_residual + weighted_depth * depth_residual;
           for (int k = i; k < 6; ++k)
-            H[entry++] += weighted_photometric * by_photometric[k] + weighted_depth * by_depth[k];
-          for (int k = 6; k < kUnknowns; ++k) H[entry++] += weighted_photometric * by_photometric[k];
+            total.H[entry++] += weighted_photometric * by_photometric[k] + weighted_depth * by_depth[k];
+          for (int k = 6; k < kUnknowns; ++k) total.H[entry++] += weighted_photometric * by_photometric[k];
         } else {
-          g[i] += weighted_photometric * photometric_residual;
-          for (int k = i; k < kUnknowns; ++k) H[entry++] += weighted_photometric * by_photometric[k];
+          total.g[i] += weighted_photometric * photometric_residual;
+          for (int k = i; k < kUnknowns; ++k) total.H[entry++] += weighted_photometric * by_photometric[k];
         }
       }
     }
-    for (int i = 0; i < kUnknowns * (kUnknowns + 1) / 2; ++i) sums.H[i] += sum(H[i]);
-    for (int i = 0; i < kUnknowns; ++i) sums.g[i] += sum(g[i]);
-    sums.cost += sum(cost);
+    add(sums, total);
   }
 }

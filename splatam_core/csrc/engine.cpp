@@ -12,6 +12,8 @@
 namespace splatam {
 namespace {
 
+#include "projection.inl"
+
 constexpr int kDigitBits = 10, kDigitsOfDepth = 3;  // hold every depth from 0.2 m on
 constexpr std::size_t kDigits = std::size_t(1) << kDigitBits;
 
@@ -301,7 +303,7 @@ namespace {
 void project_backward(const View& view, std::size_t splat, const SplatGradient& g, const GaussianArrays& gaussians,
                       const MapGradients& map, double pose_gradient[12]) {
   const std::size_t id = view.ids[splat];
-  const GaussianGradient by_gaussian = through_projection(view.splats[splat], g, view.camera);
+  const GaussianGradient<float> by_gaussian = through_projection(view.splats[splat], g, view.camera);
   const float *mean = gaussians.means + 3 * id, *d = by_gaussian.camera;
   for (int row = 0; row < 3; ++row) {
     for (int column = 0; column < 3; ++column) pose_gradient[4 * row + column] += double(d[row]) * mean[column];

@@ -24,9 +24,11 @@ struct Pose {  // world to camera
 };
 
 // A projected Gaussian: alpha(d) = opacity exp(falloff d^2) at d pixels from (u, v).
-struct Splat {
-  float u, v, falloff, opacity, r, g, b, z;
+template <typename Value>
+struct BasicSplat {
+  Value u, v, falloff, opacity, r, g, b, z;
 };
+using Splat = BasicSplat<float>;
 
 // The tiles that a splat's disc touches: columns x0..x1 and rows y0..y1, without the corners that the disc misses (bits
 // 0 to 3: top left, top right, bottom left, bottom right).
@@ -43,8 +45,17 @@ constexpr std::size_t kMaxEntries = std::size_t(1) << 26;
 constexpr float kHuge = 1e30f;
 
 // Sums over pixels of dL/d(log alpha) times 1, dx, dy, d^2, and of dL/d(r, g, b, z).
-struct SplatGradient {
-  float log_alpha, dx, dy, squared, r, g, b, z;
+template <typename Value>
+struct BasicSplatGradient {
+  Value log_alpha, dx, dy, squared, r, g, b, z;
+};
+using SplatGradient = BasicSplatGradient<float>;
+
+// The gradient by a Gaussian's parameters.
+template <typename Value>
+struct GaussianGradient {
+  Value camera[3];  // by the centre in camera coordinates
+  Value log_scale, logit_opacity;
 };
 
 struct GaussianArrays {
@@ -119,24 +130,6 @@ struct ResidualHistogram {
   std::uint32_t photometric[kResidualBins], depth[kResidualBins];
 };
 
-// The gradient by a Gaussian's parameters: a SplatGradient passed back through the projection.
-struct GaussianGradient {
-  float camera[3];  // by the centre in camera coordinates
-  float log_scale, logit_opacity;
-};
-
-static inline GaussianGradient through_projection(const Splat& s, const SplatGradient& g, const Camera& camera) {
-  const float inverse_z = 1.0f / s.z;
-  const float inverse_variance = -2.0f * s.falloff, variance = 1.0f / inverse_variance;
-  const float du = g.dx * inverse_variance, dv = g.dy * inverse_variance;  // dx is pixel minus centre
-  const float dvariance = 0.5f * g.squared * inverse_variance * inverse_variance;
-  const float spread = 2.0f * (variance - kBlur);  // d variance / d log scale
-  const float x_over_z = (s.u - camera.cx) / camera.fx, y_over_z = (s.v - camera.cy) / camera.fy;
-  const float dx = du * camera.fx * inverse_z, dy = dv * camera.fy * inverse_z;
-  const float dz = g.z - dx * x_over_z - dy * y_over_z - dvariance * spread * inverse_z;
-  return {{dx, dy, dz}, dvariance * spread, g.log_alpha * (1.0f - s.opacity)};
-}
-
 struct Kernels {
   // Projects Gaussians [begin, end); writes the visible ones to splats, rects and ids, from `begin` on.
   // Returns how many are visible.
@@ -173,7 +166,7 @@ const Kernels& kernels_avx512();
 #endif
 
 // Returns the kernels of the best instruction set that this processor has. SPLATAM_ISA=generic|avx2|avx512 limits the
-// choice.
+// choice; another value is std::invalid_argument.
 const Kernels& best_kernels();
 
 }  // namespace splatam

@@ -1,28 +1,44 @@
-// Included once per instruction set, inside a namespace and a target region, after lanes.inl.
+// Included once per instruction set, inside a namespace and a target region, after projection.inl and lanes.inl.
 
-static inline bool is_usable(float x) { return x > -kHuge && x < kHuge; }  // false for NaN
+static inline bool is_usable(float x) {  // false for NaN
+  std::uint32_t magnitude, limit;
+  __builtin_memcpy(&magnitude, &x, sizeof x);
+  __builtin_memcpy(&limit, &kHuge, sizeof limit);
+  return (magnitude & 0x7fffffff) < limit;
+}
 
-static inline float clamp(float x, float low, float high) { return x < low ? low : x > high ? high : x; }
+static inline Lanes clamp(Lanes x, float low, float high) { return min(max(x, splat(low)), splat(high)); }
 
-static inline TileRect touched_tiles(float u, float v, float extent, const Camera& camera) {
+// The fields of eight TileRects; missed_corners counts only where the rect is more than one tile wide and high.
+struct TileRects {
+  std::int32_t x0[8], y0[8], x1[8], y1[8], missed_corners[8];
+  TileRect operator[](int i) const {
+    TileRect rect;
+    rect.x0 = std::uint16_t(x0[i]), rect.y0 = std::uint16_t(y0[i]);
+    rect.x1 = std::uint16_t(x1[i]), rect.y1 = std::uint16_t(y1[i]);
+    rect.missed_corners = std::uint16_t(x0[i] == x1[i] || y0[i] == y1[i] ? 0 : missed_corners[i]);
+    return rect;
+  }
+};
+
+static inline TileRects touched_tiles(Lanes u, Lanes v, Lanes extent, const Camera& camera) {
+  static_assert(kTile == 8, "a shift by three divides by it");
   const float right = float(camera.width - 1), bottom = float(camera.height - 1);
-  TileRect rect;
-  rect.x0 = std::uint16_t(int(clamp(u - extent, 0.0f, right)) / kTile);
-  rect.x1 = std::uint16_t(int(clamp(u + extent, 0.0f, right)) / kTile);
-  rect.y0 = std::uint16_t(int(clamp(v - extent, 0.0f, bottom)) / kTile);
-  rect.y1 = std::uint16_t(int(clamp(v + extent, 0.0f, bottom)) / kTile);
-  rect.missed_corners = 0;
-  if (rect.x0 == rect.x1 || rect.y0 == rect.y1) return rect;
+  const IntLanes x0 = truncated(clamp(u - extent, 0.0f, right)) >> 3;
+  const IntLanes x1 = truncated(clamp(u + extent, 0.0f, right)) >> 3;
+  const IntLanes y0 = truncated(clamp(v - extent, 0.0f, bottom)) >> 3;
+  const IntLanes y1 = truncated(clamp(v + extent, 0.0f, bottom)) >> 3;
   // Distance from the centre to the nearest pixel of the outer columns and rows.
-  const float left = clamp(u - float(rect.x0 * kTile + kTile - 1), 0.0f, 1e9f),
-              above = clamp(v - float(rect.y0 * kTile + kTile - 1), 0.0f, 1e9f);
-  const float past = clamp(float(rect.x1 * kTile) - u, 0.0f, 1e9f),
-              below = clamp(float(rect.y1 * kTile) - v, 0.0f, 1e9f);
-  const float limit = extent * extent;
-  rect.missed_corners =
-      std::uint16_t((left * left + above * above > limit) | (past * past + above * above > limit) << 1 |
-                    (left * left + below * below > limit) << 2 | (past * past + below * below > limit) << 3);
-  return rect;
+  const Lanes left = clamp(u - to_float((x0 << 3) + (kTile - 1)), 0.0f, 1e9f);
+  const Lanes above = clamp(v - to_float((y0 << 3) + (kTile - 1)), 0.0f, 1e9f);
+  const Lanes past = clamp(to_float(x1 << 3) - u, 0.0f, 1e9f), below = clamp(to_float(y1 << 3) - v, 0.0f, 1e9f);
+  const Lanes limit = extent * extent;
+  const IntLanes missed = ((left * left + above * above > limit) & 1) | ((past * past + above * above > limit) & 2) |
+                          ((left * left + below * below > limit) & 4) | ((past * past + below * below > limit) & 8);
+  TileRects rects;
+  store(rects.x0, x0), store(rects.y0, y0), store(rects.x1, x1), store(rects.y1, y1);
+  store(rects.missed_corners, missed);
+  return rects;
 }
 
 static std::size_t project(const GaussianArrays& gaussians, const Camera& camera, const Pose& pose, std::size_t begin,
@@ -31,13 +47,12 @@ static std::size_t project(const GaussianArrays& gaussians, const Camera& camera
   const float focal = camera.focal();
   for (std::size_t first = begin; first < end; first += 8) {
     const int count = end - first < 8 ? int(end - first) : 8;
-    Lanes x{}, y{}, z{}, log_scale{}, logit{};
-    for (int i = 0; i < count; ++i) {
-      const float* mean = gaussians.means + 3 * (first + i);
-      x[i] = mean[0], y[i] = mean[1], z[i] = mean[2];
-      log_scale[i] = gaussians.log_scales[first + i];
-      logit[i] = gaussians.logit_opacities[first + i];
-    }
+    float means[3][8] = {};
+    for (int i = 0; i < count; ++i)
+      for (int axis = 0; axis < 3; ++axis) means[axis][i] = gaussians.means[3 * (first + i) + axis];
+    const Lanes x = load(means[0]), y = load(means[1]), z = load(means[2]);
+    const Lanes log_scale = load_some(gaussians.log_scales + first, count, Lanes{});
+    const Lanes logit = load_some(gaussians.logit_opacities + first, count, Lanes{});
     const float *R = pose.R, *t = pose.t;
     const Lanes cam_x = R[0] * x + R[1] * y + R[2] * z + t[0];
     const Lanes cam_y = R[3] * x + R[4] * y + R[5] * z + t[1];
@@ -54,12 +69,18 @@ static std::size_t project(const GaussianArrays& gaussians, const Camera& camera
                            (absolute(logit) < kHuge) & (opacity >= kMinAlpha) & (u + extent >= 0.0f) &
                            (u - extent <= float(camera.width - 1)) & (v + extent >= 0.0f) &
                            (v - extent <= float(camera.height - 1));
+    if (!any(drawn)) continue;
+    const TileRects touched = touched_tiles(u, v, extent, camera);
+    std::int32_t is_drawn[8];
+    float us[8], vs[8], falloffs[8], opacities[8], depths[8];
+    store(is_drawn, drawn);
+    store(us, u), store(vs, v), store(falloffs, -0.5f / variance), store(opacities, opacity), store(depths, cam_z);
     for (int i = 0; i < count; ++i) {
-      if (!drawn[i]) continue;
+      if (!is_drawn[i]) continue;
       const float* rgb = gaussians.rgb + 3 * (first + i);
       if (!(is_usable(rgb[0]) && is_usable(rgb[1]) && is_usable(rgb[2]))) continue;
-      splats[visible] = {u[i], v[i], -0.5f / variance[i], opacity[i], rgb[0], rgb[1], rgb[2], cam_z[i]};
-      rects[visible] = touched_tiles(u[i], v[i], extent[i], camera);
+      splats[visible] = {us[i], vs[i], falloffs[i], opacities[i], rgb[0], rgb[1], rgb[2], depths[i]};
+      rects[visible] = touched[i];
       ids[visible] = std::uint32_t(first + i);
       ++visible;
     }
@@ -67,16 +88,23 @@ static std::size_t project(const GaussianArrays& gaussians, const Camera& camera
   return visible - begin;
 }
 
+// A tile's upper left pixel.
+struct Corner {
+  Uniform x, y;
+};
+
+static inline Corner corner(const TileList& tile) { return {uniform_of_int(tile.x), uniform_of_int(tile.y)}; }
+
 // A splat within one tile: its offsets, and the two separable factors of its alpha (per column, per row).
 struct Footprint {
   Lanes dx, across;
   float dy[8], down[8];
 };
 
-static inline Footprint footprint(const Splat& s, const TileList& tile) {
+static inline Footprint footprint(const Splat& s, const Corner& tile) {
   Footprint f;
-  f.dx = iota() + (float(tile.x) - s.u);
-  const Lanes dy = iota() + (float(tile.y) - s.v);
+  f.dx = iota() + (tile.x - uniform(s.u));
+  const Lanes dy = iota() + (tile.y - uniform(s.v));
   f.across = exp(f.dx * f.dx * s.falloff);
   store(f.dy, dy);
   store(f.down, s.opacity * exp(dy * dy * s.falloff));
@@ -85,68 +113,75 @@ static inline Footprint footprint(const Splat& s, const TileList& tile) {
 
 // Returns a mask of the lanes of a tile's row that are inside the image.
 static inline IntLanes on_image(const TileList& tile, const Camera& camera, int row) {
-  const float columns = tile.y + row < camera.height ? float(camera.width - tile.x) : 0.0f;
-  return iota() < columns;
+  return int_iota() < splat_int(tile.y + row < camera.height ? camera.width - tile.x : 0);
 }
 
-constexpr int kPairs = kTile / 2;
+constexpr int kGroups = kTile / kRows;  // of rows that are blended at once
 
-// Returns whether every pixel of a tile is saturated. Rows is Pixels or PixelGradients. Call it at least every 16
+// Returns whether every pixel of a tile is saturated. Group is Pixels or PixelGradients. Call it at least every 16
 // splats: it also resets the transmittance of saturated pixels, before that becomes a denormal number.
-template <typename Rows>
-static inline bool opaque(Rows* rows) {
-  IntPair open{};
-  for (int i = 0; i < kPairs; ++i) {
-    const IntPair more = rows[i].T >= kMinTransmittance;
-    rows[i].T = either(more, rows[i].T, Pair{} + 0.5f * kMinTransmittance);
+template <typename Group>
+static inline bool opaque(Group* rows) {
+  IntRows open{};
+  for (int i = 0; i < kGroups; ++i) {
+    const IntRows more = rows[i].T >= kMinTransmittance;
+    rows[i].T = either(more, rows[i].T, repeated(splat(0.5f * kMinTransmittance)));
     open |= more;
   }
   return !any(open);
 }
 
+static inline int columns_of(const TileList& tile, const Camera& camera) {
+  return camera.width - tile.x < kTile ? camera.width - tile.x : kTile;
+}
+
 static inline Lanes load_row(const float* plane, const TileList& tile, const Camera& camera, int row) {
-  float values[8] = {};
-  const int columns = camera.width - tile.x < 8 ? camera.width - tile.x : 8;
-  if (tile.y + row < camera.height)
-    __builtin_memcpy(values, plane + std::size_t(tile.y + row) * camera.width + tile.x, sizeof(float) * columns);
-  return load(values);
+  if (tile.y + row >= camera.height) return Lanes{};
+  const float* from = plane + std::size_t(tile.y + row) * camera.width + tile.x;
+  return load_some(from, columns_of(tile, camera), Lanes{});
 }
 
 static inline void store_row(float* plane, const TileList& tile, const Camera& camera, int row, Lanes value) {
   if (tile.y + row >= camera.height) return;
-  const int columns = camera.width - tile.x < 8 ? camera.width - tile.x : 8;
   float values[8];
   store(values, value);
-  __builtin_memcpy(plane + std::size_t(tile.y + row) * camera.width + tile.x, values, sizeof(float) * columns);
+  __builtin_memcpy(plane + std::size_t(tile.y + row) * camera.width + tile.x, values,
+                   sizeof(float) * columns_of(tile, camera));
 }
 
-static inline Pair load_rows(const float* plane, const TileList& tile, const Camera& camera, int row) {
-  return pair(load_row(plane, tile, camera, row), load_row(plane, tile, camera, row + 1));
+static inline Rows load_rows(const float* plane, const TileList& tile, const Camera& camera, int row) {
+  return rows_of([&](int i) { return load_row(plane, tile, camera, row + i); });
 }
 
-static inline void store_rows(float* plane, const TileList& tile, const Camera& camera, int row, Pair values) {
-  store_row(plane, tile, camera, row, upper(values));
-  store_row(plane, tile, camera, row + 1, lower(values));
+static inline void store_rows(float* plane, const TileList& tile, const Camera& camera, int row, Rows values) {
+  for (int i = 0; i < kRows; ++i) store_row(plane, tile, camera, row + i, row_of(values, i));
 }
 
-static inline Pair first_transmittance(const TileList& tile, const Camera& camera, int row) {
-  return pair(keep(on_image(tile, camera, row), splat(1.0f)), keep(on_image(tile, camera, row + 1), splat(1.0f)));
+static inline Rows first_transmittance(const TileList& tile, const Camera& camera, int row) {
+  return rows_of([&](int i) { return keep(on_image(tile, camera, row + i), splat(1.0f)); });
 }
 
-struct Pixels {  // two rows being blended
-  Pair T, r, g, b, depth, silhouette;
+struct Pixels {  // a group of rows being blended
+  Rows T, r, g, b, depth, silhouette;
 };
 
 static inline void start(Pixels* pixels, const TileList& tile, const Camera& camera) {
-  for (int i = 0; i < kPairs; ++i) {
+  for (int i = 0; i < kGroups; ++i) {
     pixels[i] = Pixels{};
-    pixels[i].T = first_transmittance(tile, camera, 2 * i);
+    pixels[i].T = first_transmittance(tile, camera, kRows * i);
   }
 }
 
-static inline void blend(Pixels& pixels, Pair raw_alpha, const Splat& s) {
-  const Pair alpha = keep(raw_alpha >= kMinAlpha, min(raw_alpha, kMaxAlpha));
-  const Pair w = keep(pixels.T >= kMinTransmittance, alpha * pixels.T);
+// A splat's values, as operands.
+struct Values {
+  Uniform r, g, b, z;
+};
+
+static inline Values values_of(const Splat& s) { return {uniform(s.r), uniform(s.g), uniform(s.b), uniform(s.z)}; }
+
+static inline void blend(Pixels& pixels, Rows raw_alpha, const Values& s) {
+  const Rows alpha = keep(raw_alpha >= kMinAlpha, min(raw_alpha, kMaxAlpha));
+  const Rows w = keep(pixels.T >= kMinTransmittance, alpha * pixels.T);
   pixels.r += w * s.r;
   pixels.g += w * s.g;
   pixels.b += w * s.b;
@@ -155,81 +190,125 @@ static inline void blend(Pixels& pixels, Pair raw_alpha, const Splat& s) {
   pixels.T *= 1.0f - alpha;  // also in saturated pixels: the shortest path to the next splat's T
 }
 
-// Returns a splat's alpha in two rows, before it is clamped.
-static inline Pair raw_alpha(const Footprint& f, int row) {
-  return pair(f.down[row], f.down[row + 1]) * pair(f.across, f.across);
+// Returns rows whose values are the same in all columns.
+static inline Rows spread(const float* per_row) {
+  return rows_of([&](int i) { return splat(per_row[i]); });
+}
+
+// Returns a splat's alpha in a group of rows, before it is clamped.
+static inline Rows raw_alpha(const Footprint& f, int group) {
+  return spread(f.down + kRows * group) * repeated(f.across);
 }
 
 constexpr std::size_t kBatch = 16;
 
-// Blends up to kBatch splats into a tile, pair of rows by pair, so that the pixels stay in registers. Pairs that a
-// splat does not reach are not skipped: mispredicted branches cost more than blending zeros.
-static inline void blend(Pixels* pixels, const Splat* batch, const Footprint* footprints, std::size_t size) {
-  for (int i = 0; i < kPairs; ++i) {
+// Returns the lanes of the rows of a tile in which a splat reaches a pixel.
+static inline IntLanes reached_rows(const Footprint& f) { return load(f.down) * highest(f.across) >= kMinAlpha; }
+
+// Returns, for each group of rows, the splats of a batch that reach it, as a bit per splat.
+static inline void find_reached(const Footprint* footprints, std::size_t size, std::uint32_t* reached) {
+  static_assert(kRows == 1 || !kSkipRows, "a group of several rows is reached where one of them is");
+  if constexpr (kSkipRows) {
+    IntLanes by_row{};
+    for (std::size_t k = 0; k < size; ++k) by_row |= reached_rows(footprints[k]) & (1 << k);
+    __builtin_memcpy(reached, &by_row, sizeof by_row);
+  }
+}
+
+// Blends up to kBatch splats into a tile, group of rows by group, so that the pixels stay in registers. Rows that a
+// splat does not reach are skipped only where the blending of one takes longer than a mispredicted branch.
+static inline void blend(Pixels* pixels, const Values* batch, const Footprint* footprints, std::size_t size) {
+  std::uint32_t reached[kGroups];
+  find_reached(footprints, size, reached);
+  for (int i = 0; i < kGroups; ++i) {
     Pixels rows = pixels[i];
-    for (std::size_t k = 0; k < size; ++k) blend(rows, raw_alpha(footprints[k], 2 * i), batch[k]);
+    if constexpr (kSkipRows) {
+      for (std::uint32_t left = reached[i]; left != 0; left &= left - 1) {
+        const int k = __builtin_ctz(left);
+        blend(rows, raw_alpha(footprints[k], i), batch[k]);
+      }
+    } else {
+      for (std::size_t k = 0; k < size; ++k) blend(rows, raw_alpha(footprints[k], i), batch[k]);
+    }
     pixels[i] = rows;
   }
 }
 
 static void forward(const TileList& tile, const Splat* splats, const Camera& camera, const Images& images) {
   const std::size_t plane = std::size_t(camera.width) * camera.height;
-  Pixels pixels[kPairs];
+  Pixels pixels[kGroups];
   start(pixels, tile, camera);
-  Splat batch[kBatch];
+  const Corner at = corner(tile);
+  Values batch[kBatch];
   Footprint footprints[kBatch];
   for (std::size_t first = 0; first < tile.count && !opaque(pixels); first += kBatch) {
     const std::size_t size = tile.count - first < kBatch ? tile.count - first : kBatch;
     for (std::size_t k = 0; k < size; ++k) {
-      batch[k] = splats[tile.splats[first + k]];
-      footprints[k] = footprint(batch[k], tile);
+      const Splat& s = splats[tile.splats[first + k]];
+      batch[k] = values_of(s);
+      footprints[k] = footprint(s, at);
     }
     blend(pixels, batch, footprints, size);
   }
-  for (int i = 0; i < kPairs; ++i) {
-    store_rows(images.rgb, tile, camera, 2 * i, pixels[i].r);
-    store_rows(images.rgb + plane, tile, camera, 2 * i, pixels[i].g);
-    store_rows(images.rgb + 2 * plane, tile, camera, 2 * i, pixels[i].b);
-    store_rows(images.depth, tile, camera, 2 * i, pixels[i].depth);
-    store_rows(images.silhouette, tile, camera, 2 * i, pixels[i].silhouette);
+  for (int i = 0; i < kGroups; ++i) {
+    store_rows(images.rgb, tile, camera, kRows * i, pixels[i].r);
+    store_rows(images.rgb + plane, tile, camera, kRows * i, pixels[i].g);
+    store_rows(images.rgb + 2 * plane, tile, camera, kRows * i, pixels[i].b);
+    store_rows(images.depth, tile, camera, kRows * i, pixels[i].depth);
+    store_rows(images.silhouette, tile, camera, kRows * i, pixels[i].silhouette);
   }
 }
 
-// Two rows in the backward pass, which also goes front to back.
+// A group of rows in the backward pass, which also goes front to back.
 struct PixelGradients {
-  Pair T, Q;                        // transmittance; the part of sum_k w_k q_k that is still to come, see blend_back()
-  Pair r, g, b, depth, silhouette;  // gradients of the loss by the pixel's values
+  Rows T, Q;                        // transmittance; the part of sum_k w_k q_k that is still to come, see blend_back()
+  Rows r, g, b, depth, silhouette;  // gradients of the loss by the pixel's values
 };
 
-// The backward pass of one splat. With q_k = sum over channels of (gradient of the channel times value of splat k),
-// dL/dalpha_k = T_k q_k - Q / (1 - alpha_k).
+// The sums of blend_back() over the groups of rows.
+struct Sums {
+  Rows by_alpha, by_y, by_y_squared, by_r, by_g, by_b, by_z;
+};
+
+// The backward pass of one splat in a group of rows. With q_k = sum over channels of (gradient of the channel times
+// value of splat k), dL/dalpha_k = T_k q_k - Q / (1 - alpha_k).
 template <bool kMap>
-static inline void blend_back(PixelGradients* rows, const Splat& s, const Footprint& f, SplatGradient& gradient) {
-  Pair by_alpha{}, by_y{}, by_y_squared{}, by_r{}, by_g{}, by_b{}, by_z{};
-  for (int i = 0; i < kPairs; ++i) {
-    PixelGradients& at = rows[i];
-    const Pair raw = raw_alpha(f, 2 * i), dy = pair(f.dy[2 * i], f.dy[2 * i + 1]);
-    const Pair alpha = keep(raw >= kMinAlpha, min(raw, kMaxAlpha));
-    const IntPair takes = at.T >= kMinTransmittance;
-    const Pair w = keep(takes, alpha * at.T), left = 1.0f - alpha;
-    const Pair q = at.r * s.r + at.g * s.g + at.b * s.b + at.depth * s.z + at.silhouette;
-    at.Q -= w * q;
-    const Pair gradient_by_log_alpha = keep(takes & (raw <= kMaxAlpha), alpha * (at.T * q - at.Q / left));
-    by_alpha += gradient_by_log_alpha;
-    by_y += gradient_by_log_alpha * dy;
-    by_y_squared += gradient_by_log_alpha * dy * dy;
-    if (kMap) {
-      by_r += w * at.r;
-      by_g += w * at.g;
-      by_b += w * at.b;
-    }
-    by_z += w * at.depth;
-    at.T *= left;
+static inline void blend_back(PixelGradients& at, const Values& s, const Footprint& f, int group, Sums& sums) {
+  const Rows raw = raw_alpha(f, group), dy = spread(f.dy + kRows * group);
+  const Rows alpha = keep(raw >= kMinAlpha, min(raw, kMaxAlpha));
+  const IntRows takes = at.T >= kMinTransmittance;
+  const Rows w = keep(takes, alpha * at.T), left = 1.0f - alpha;
+  const Rows q = at.r * s.r + at.g * s.g + at.b * s.b + at.depth * s.z + at.silhouette;
+  at.Q -= w * q;
+  const Rows gradient_by_log_alpha = keep(takes & (raw <= kMaxAlpha), alpha * (at.T * q - at.Q / left));
+  sums.by_alpha += gradient_by_log_alpha;
+  sums.by_y += gradient_by_log_alpha * dy;
+  sums.by_y_squared += gradient_by_log_alpha * dy * dy;
+  if (kMap) {
+    sums.by_r += w * at.r;
+    sums.by_g += w * at.g;
+    sums.by_b += w * at.b;
   }
-  const auto folded = [](Pair rows) { return upper(rows) + lower(rows); };
-  const Lanes by_column = folded(by_alpha), by_x = by_column * f.dx;
-  const Lanes sums[8] = {by_column,    by_x,         folded(by_y), by_x * f.dx + folded(by_y_squared),
-                         folded(by_r), folded(by_g), folded(by_b), folded(by_z)};  // as in SplatGradient
+  sums.by_z += w * at.depth;
+  at.T *= left;
+}
+
+template <bool kMap>
+static inline void blend_back(PixelGradients* rows, const Values& s, const Footprint& f, SplatGradient& gradient) {
+  Sums by{};
+  if constexpr (kSkipRows) {
+    for (unsigned left = bits_of_mask(reached_rows(f)); left != 0; left &= left - 1) {
+      const int i = __builtin_ctz(left);
+      blend_back<kMap>(rows[i], s, f, i, by);
+    }
+  } else {
+    for (int i = 0; i < kGroups; ++i) blend_back<kMap>(rows[i], s, f, i, by);
+  }
+  const Lanes by_column = folded(by.by_alpha), by_x = by_column * f.dx;
+  const Lanes sums[8] = {by_column,       by_x,
+                         folded(by.by_y), by_x * f.dx + folded(by.by_y_squared),
+                         folded(by.by_r), folded(by.by_g),
+                         folded(by.by_b), folded(by.by_z)};  // as in SplatGradient
   float* into = &gradient.log_alpha;
   store(into, load(into) + row_sums(sums));
 }
@@ -238,20 +317,21 @@ template <bool kMap>
 static inline void backward_tile(const TileList& tile, const Splat* splats, const Camera& camera,
                                  const ConstImages& drawn, const ConstImages& gradient, SplatGradient* gradients) {
   const std::size_t plane = std::size_t(camera.width) * camera.height;
-  PixelGradients rows[kPairs];
-  for (int i = 0; i < kPairs; ++i) {
-    const auto load = [&](const float* image) { return load_rows(image, tile, camera, 2 * i); };
-    PixelGradients& at = rows[i];
-    at.T = first_transmittance(tile, camera, 2 * i);
-    at.r = load(gradient.rgb), at.g = load(gradient.rgb + plane), at.b = load(gradient.rgb + 2 * plane);
-    at.depth = load(gradient.depth), at.silhouette = load(gradient.silhouette);
-    at.Q = at.r * load(drawn.rgb) + at.g * load(drawn.rgb + plane) + at.b * load(drawn.rgb + 2 * plane) +
-           at.depth * load(drawn.depth) + at.silhouette * load(drawn.silhouette);
+  const Corner at = corner(tile);
+  PixelGradients rows[kGroups];
+  for (int i = 0; i < kGroups; ++i) {
+    const auto load = [&](const float* image) { return load_rows(image, tile, camera, kRows * i); };
+    PixelGradients& to = rows[i];
+    to.T = first_transmittance(tile, camera, kRows * i);
+    to.r = load(gradient.rgb), to.g = load(gradient.rgb + plane), to.b = load(gradient.rgb + 2 * plane);
+    to.depth = load(gradient.depth), to.silhouette = load(gradient.silhouette);
+    to.Q = to.r * load(drawn.rgb) + to.g * load(drawn.rgb + plane) + to.b * load(drawn.rgb + 2 * plane) +
+           to.depth * load(drawn.depth) + to.silhouette * load(drawn.silhouette);
   }
   for (std::size_t k = 0; k < tile.count; ++k) {
     if (k % 8 == 7 && opaque(rows)) break;
     const Splat& s = splats[tile.splats[k]];
-    blend_back<kMap>(rows, s, footprint(s, tile), gradients[tile.splats[k]]);
+    blend_back<kMap>(rows, values_of(s), footprint(s, at), gradients[tile.splats[k]]);
   }
 }
 
@@ -266,9 +346,9 @@ static void backward(const TileList& tile, const Splat* splats, const Camera& ca
 static_assert(sizeof(Footprint) == kFloatsPerFootprint * sizeof(float), "scratch is allocated elsewhere");
 
 static inline Lanes load_bytes(const std::uint8_t* pixels, int columns, int channel) {
-  Lanes values{};
-  for (int i = 0; i < columns; ++i) values[i] = float(pixels[3 * i + channel]);
-  return values * (1.0f / 255.0f);
+  std::int32_t values[8] = {};
+  for (int i = 0; i < columns; ++i) values[i] = pixels[3 * i + channel];
+  return to_float(load(values)) * (1.0f / 255.0f);
 }
 
 // Huber's loss of one row, its gradient by the pixel values, and Q of blend_back() before the first splat.
@@ -277,131 +357,187 @@ struct Comparison {
   double loss;
 };
 
+// Huber's loss of a channel.
+struct Huber {
+  float weight, inverse_limit, half_limit;
+};
+
+static inline Huber huber(float weight, float limit) { return {weight, 1.0f / limit, 0.5f * limit}; }
+
 // Gradient of Huber's loss: linear up to the limit, constant beyond.
-static inline Lanes huber_gradient(Lanes residual, float limit) {
-  const Lanes gradient = residual * (1.0f / limit);
+static inline Lanes huber_gradient(Lanes residual, const Huber& huber) {
+  const Lanes gradient = residual * huber.inverse_limit;
   return max(min(gradient, splat(1.0f)), splat(-1.0f));
 }
 
-static inline Lanes huber_loss(Lanes residual, Lanes gradient, float limit) {
-  return gradient * (residual - 0.5f * limit * gradient);
+static inline Lanes huber_loss(Lanes residual, Lanes gradient, const Huber& huber) {
+  return gradient * (residual - huber.half_limit * gradient);
 }
 
+// A target, and the loss of its colour and depth.
+struct Compared {
+  const Target& target;
+  Huber color, depth;
+};
+
 static inline Comparison compare(Lanes r, Lanes g, Lanes b, Lanes depth, const TileList& tile, const Camera& camera,
-                                 int row, const Target& target) {
+                                 int row, const Compared& to) {
+  const Target& target = to.target;
   Comparison result{};
   if (tile.y + row >= camera.height) return result;
-  const int columns = camera.width - tile.x < 8 ? camera.width - tile.x : 8;
+  const int columns = columns_of(tile, camera);
   const std::size_t at = std::size_t(tile.y + row) * camera.width + tile.x;
-  const IntLanes real = iota() < float(columns);
-  Lanes reading{};
-  __builtin_memcpy(&reading, target.depth + at, sizeof(float) * columns);
+  const IntLanes real = int_iota() < splat_int(columns);
+  const Lanes reading = load_some(target.depth + at, columns, Lanes{});
   const std::uint8_t* colors = target.rgb + 3 * at;
-  const Lanes red = keep(real, r - load_bytes(colors, columns, 0)), by_r = huber_gradient(red, target.color_limit);
-  const Lanes green = keep(real, g - load_bytes(colors, columns, 1)), by_g = huber_gradient(green, target.color_limit);
-  const Lanes blue = keep(real, b - load_bytes(colors, columns, 2)), by_b = huber_gradient(blue, target.color_limit);
-  const Lanes range = keep(real & (reading > 0.0f), depth - reading),
-              by_range = huber_gradient(range, target.depth_limit);
-  const Lanes loss =
-      target.color_weight * (huber_loss(red, by_r, target.color_limit) + huber_loss(green, by_g, target.color_limit) +
-                             huber_loss(blue, by_b, target.color_limit)) +
-      target.depth_weight * huber_loss(range, by_range, target.depth_limit);
-  for (int i = 0; i < 8; ++i) result.loss += loss[i];
-  result.r = target.color_weight * by_r, result.g = target.color_weight * by_g, result.b = target.color_weight * by_b;
-  result.depth = target.depth_weight * by_range;
+  const Lanes red = keep(real, r - load_bytes(colors, columns, 0)), by_r = huber_gradient(red, to.color);
+  const Lanes green = keep(real, g - load_bytes(colors, columns, 1)), by_g = huber_gradient(green, to.color);
+  const Lanes blue = keep(real, b - load_bytes(colors, columns, 2)), by_b = huber_gradient(blue, to.color);
+  const Lanes range = keep(real & (reading > 0.0f), depth - reading), by_range = huber_gradient(range, to.depth);
+  const Lanes loss = to.color.weight * (huber_loss(red, by_r, to.color) + huber_loss(green, by_g, to.color) +
+                                        huber_loss(blue, by_b, to.color)) +
+                     to.depth.weight * huber_loss(range, by_range, to.depth);
+  result.loss = sum(loss);
+  result.r = to.color.weight * by_r, result.g = to.color.weight * by_g, result.b = to.color.weight * by_b;
+  result.depth = to.depth.weight * by_range;
   result.Q = result.r * r + result.g * g + result.b * b + result.depth * depth;
   return result;
 }
 
-// Starts the backward pass of two rows: compares them with the target. Returns their loss.
+// Starts the backward pass of a group of rows: compares them with the target. Returns their loss.
 static inline double start(PixelGradients& rows, const Pixels& drawn, const TileList& tile, const Camera& camera,
-                           int row, const Target& target) {
-  const Comparison a =
-      compare(upper(drawn.r), upper(drawn.g), upper(drawn.b), upper(drawn.depth), tile, camera, row, target);
-  const Comparison b =
-      compare(lower(drawn.r), lower(drawn.g), lower(drawn.b), lower(drawn.depth), tile, camera, row + 1, target);
+                           int row, const Compared& to) {
+  Comparison compared[kRows];
+  double loss = 0.0;
+  for (int i = 0; i < kRows; ++i) {
+    compared[i] = compare(row_of(drawn.r, i), row_of(drawn.g, i), row_of(drawn.b, i), row_of(drawn.depth, i), tile,
+                          camera, row + i, to);
+    loss += compared[i].loss;
+  }
   rows = {first_transmittance(tile, camera, row),
-          pair(a.Q, b.Q),
-          pair(a.r, b.r),
-          pair(a.g, b.g),
-          pair(a.b, b.b),
-          pair(a.depth, b.depth),
-          Pair{}};
-  return a.loss + b.loss;
+          rows_of([&](int i) { return compared[i].Q; }),
+          rows_of([&](int i) { return compared[i].r; }),
+          rows_of([&](int i) { return compared[i].g; }),
+          rows_of([&](int i) { return compared[i].b; }),
+          rows_of([&](int i) { return compared[i].depth; }),
+          Rows{}};
+  return loss;
 }
 
 static double fit(const TileList& tile, const Splat* splats, const Camera& camera, const Target& target, float* scratch,
                   SplatGradient* gradients) {
   Footprint* footprints = reinterpret_cast<Footprint*>(scratch);
-  Pixels pixels[kPairs];
+  Pixels pixels[kGroups];
   start(pixels, tile, camera);
-  Splat batch[kBatch];
+  const Corner at = corner(tile);
+  Values batch[kBatch];
   std::size_t count = 0;
   while (count < tile.count && !opaque(pixels)) {
     const std::size_t size = tile.count - count < kBatch ? tile.count - count : kBatch;
     for (std::size_t k = 0; k < size; ++k) {
-      batch[k] = splats[tile.splats[count + k]];
-      footprints[count + k] = footprint(batch[k], tile);
+      const Splat& s = splats[tile.splats[count + k]];
+      batch[k] = values_of(s);
+      footprints[count + k] = footprint(s, at);
     }
     blend(pixels, batch, footprints + count, size);
     count += size;
   }
+  const Compared to{target, huber(target.color_weight, target.color_limit),
+                    huber(target.depth_weight, target.depth_limit)};
   double loss = 0.0;
-  PixelGradients rows[kPairs];
-  for (int i = 0; i < kPairs; ++i) loss += start(rows[i], pixels[i], tile, camera, 2 * i, target);
+  PixelGradients rows[kGroups];
+  for (int i = 0; i < kGroups; ++i) loss += start(rows[i], pixels[i], tile, camera, kRows * i, to);
   for (std::size_t k = 0; k < count; ++k)
-    blend_back<true>(rows, splats[tile.splats[k]], footprints[k], gradients[tile.splats[k]]);
+    blend_back<true>(rows, values_of(splats[tile.splats[k]]), footprints[k], gradients[tile.splats[k]]);
   return loss;
 }
 
 constexpr float kBeta1 = 0.9f, kBeta2 = 0.99f, kEpsilon = 1e-15f;
 
+// Adam's bias corrections, by the number of steps.
+struct BiasCorrections {
+  float first[256], second[256];
+  constexpr BiasCorrections() : first(), second() {
+    float left1 = 1.0f, left2 = 1.0f;
+    for (int i = 0; i < 256; ++i) {
+      first[i] = 1.0f - left1, second[i] = 1.0f - left2;
+      left1 *= kBeta1, left2 *= kBeta2;
+    }
+  }
+};
+static constexpr BiasCorrections kBiasCorrections;
+
+// Writes the gradients by the Gaussians of eight splats: mean, log scale, logit opacity and rgb, in the order of
+// the moments. Returns which splats have any, as a bit per splat.
+static inline unsigned by_gaussians(const Splat* splats, const SplatGradient* gradients, const Camera& camera,
+                                    const Pose& pose, Lanes* by_gaussian) {
+  Lanes s[8], g[8];
+  for (int i = 0; i < 8; ++i) s[i] = load(&splats[i].u), g[i] = load(&gradients[i].log_alpha);
+  transpose(s), transpose(g);
+  const BasicSplat<Lanes> splat{s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7]};
+  const BasicSplatGradient<Lanes> gradient{g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7]};
+  const GaussianGradient<Lanes> by = through_projection(splat, gradient, camera);
+  const float* R = pose.R;
+  for (int axis = 0; axis < 3; ++axis)
+    by_gaussian[axis] = R[axis] * by.camera[0] + R[3 + axis] * by.camera[1] + R[6 + axis] * by.camera[2];
+  by_gaussian[3] = by.log_scale, by_gaussian[4] = by.logit_opacity;
+  by_gaussian[5] = gradient.r, by_gaussian[6] = gradient.g, by_gaussian[7] = gradient.b;
+  transpose(by_gaussian);
+  return bits_of_mask((gradient.log_alpha != 0.0f) | (gradient.r != 0.0f) | (gradient.g != 0.0f) |
+                      (gradient.b != 0.0f) | (gradient.z != 0.0f));
+}
+
+// Takes an Adam step of one Gaussian. Widens the bounds, which are in the order of the gradient.
+static inline void adam_step(std::size_t id, Lanes gradient, Lanes rate, const MutableGaussians& gaussians,
+                             const AdamState& adam, Lanes* lowest, Lanes* highest) {
+  float* moments = adam.moments + 16 * id;
+  const Lanes first = kBeta1 * load(moments) + (1.0f - kBeta1) * gradient;
+  const Lanes second = kBeta2 * load(moments + 8) + (1.0f - kBeta2) * gradient * gradient;
+  const int step = adam.steps[id] < 255 ? adam.steps[id] + 1 : 255;
+  const Lanes move =
+      rate * (first / kBiasCorrections.first[step]) / (sqrt(second / kBiasCorrections.second[step]) + kEpsilon);
+  const IntLanes usable = (absolute(first) < kHuge) & (second < kHuge) & (absolute(move) < kHuge);
+  if (bits_of_mask(usable) != 0xff) return;  // an overflow would stay in the moments for ever
+  store(moments, first);
+  store(moments + 8, second);
+  adam.steps[id] = std::uint8_t(step);
+  float *mean = gaussians.means + 3 * id, *rgb = gaussians.rgb + 3 * id;
+  float values[8] = {mean[0], mean[1], mean[2], gaussians.log_scales[id], gaussians.logit_opacities[id],
+                     rgb[0],  rgb[1],  rgb[2]};
+  const Lanes moved = load(values) - move;
+  *lowest = min(moved, *lowest), *highest = max(moved, *highest);
+  store(values, moved);
+  for (int i = 0; i < 3; ++i) mean[i] = values[i], rgb[i] = values[5 + i];
+  gaussians.log_scales[id] = values[3], gaussians.logit_opacities[id] = values[4];
+}
+
 static void update(const Splat* splats, const std::uint32_t* ids, const SplatGradient* gradients, std::size_t begin,
                    std::size_t end, const Camera& camera, const Pose& pose, const MutableGaussians& gaussians,
                    const AdamState& adam, const AdamRates& rates, float* bounds) {
-  float left1[256], left2[256];  // Adam's bias corrections: 1 minus these
-  left1[0] = left2[0] = 1.0f;
-  for (int i = 1; i < 256; ++i) left1[i] = left1[i - 1] * kBeta1, left2[i] = left2[i - 1] * kBeta2;
-  const Lanes rate = {rates.means,           rates.means, rates.means, rates.log_scales,
-                      rates.logit_opacities, rates.rgb,   rates.rgb,   rates.rgb};
-  for (std::size_t splat_index = begin; splat_index < end; ++splat_index) {
-    const SplatGradient& g = gradients[splat_index];
-    if (g.log_alpha == 0.0f && g.r == 0.0f && g.g == 0.0f && g.b == 0.0f && g.z == 0.0f) continue;
-    const std::size_t id = ids[splat_index];
-    const GaussianGradient by_gaussian = through_projection(splats[splat_index], g, camera);
-    const float *R = pose.R, *d = by_gaussian.camera;
-    const Lanes gradient = {R[0] * d[0] + R[3] * d[1] + R[6] * d[2],
-                            R[1] * d[0] + R[4] * d[1] + R[7] * d[2],
-                            R[2] * d[0] + R[5] * d[1] + R[8] * d[2],
-                            by_gaussian.log_scale,
-                            by_gaussian.logit_opacity,
-                            g.r,
-                            g.g,
-                            g.b};
-    float* moments = adam.moments + 16 * id;
-    const Lanes first = kBeta1 * load(moments) + (1.0f - kBeta1) * gradient;
-    const Lanes second = kBeta2 * load(moments + 8) + (1.0f - kBeta2) * gradient * gradient;
-    const int step = adam.steps[id] < 255 ? adam.steps[id] + 1 : 255;
-    const Lanes move = rate * (first / (1.0f - left1[step])) / (sqrt(second / (1.0f - left2[step])) + kEpsilon);
-    const IntLanes usable = (absolute(first) < kHuge) & (second < kHuge) & (absolute(move) < kHuge);
-    if (count(usable) < 8) continue;  // an overflow would stay in the moments for ever
-    store(moments, first);
-    store(moments + 8, second);
-    adam.steps[id] = std::uint8_t(step);
-    float* mean = gaussians.means + 3 * id;
-    float* rgb = gaussians.rgb + 3 * id;
-    for (int axis = 0; axis < 3; ++axis) {
-      mean[axis] -= move[axis];
-      rgb[axis] -= move[5 + axis];
-      if (bounds) {
-        if (mean[axis] < bounds[axis]) bounds[axis] = mean[axis];
-        if (mean[axis] > bounds[3 + axis]) bounds[3 + axis] = mean[axis];
-      }
+  const float by_value[8] = {rates.means,           rates.means, rates.means, rates.log_scales,
+                             rates.logit_opacities, rates.rgb,   rates.rgb,   rates.rgb};
+  const Lanes rate = load(by_value);
+  float low[8] = {}, high[8] = {};
+  for (int i = 0; bounds && i < 3; ++i) low[i] = bounds[i], high[i] = bounds[3 + i];
+  if (bounds) high[3] = bounds[6];
+  Lanes lowest = load(low), highest = load(high);
+  for (std::size_t at = begin; at < end; at += 8) {
+    const int count = end - at < 8 ? int(end - at) : 8;
+    Splat last_splats[8];  // the loads of eight would go beyond the end
+    SplatGradient last_gradients[8];
+    for (int i = 0; count < 8 && i < 8; ++i) {
+      last_splats[i] = i < count ? splats[at + i] : Splat{};
+      last_gradients[i] = i < count ? gradients[at + i] : SplatGradient{};
     }
-    gaussians.log_scales[id] -= move[3];
-    gaussians.logit_opacities[id] -= move[4];
-    if (bounds && gaussians.log_scales[id] > bounds[6]) bounds[6] = gaussians.log_scales[id];
+    Lanes by_gaussian[8];
+    const unsigned has_any = by_gaussians(count < 8 ? last_splats : splats + at,
+                                          count < 8 ? last_gradients : gradients + at, camera, pose, by_gaussian);
+    for (int i = 0; i < count; ++i)
+      if (has_any >> i & 1) adam_step(ids[at + i], by_gaussian[i], rate, gaussians, adam, &lowest, &highest);
   }
+  store(low, lowest), store(high, highest);
+  for (int i = 0; bounds && i < 3; ++i) bounds[i] = low[i], bounds[3 + i] = high[i];
+  if (bounds) bounds[6] = high[3];
 }
 
 static constexpr Kernels table(const char* name) { return {project, forward, backward, fit, update, align, name}; }

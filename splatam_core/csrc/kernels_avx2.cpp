@@ -10,7 +10,9 @@
 namespace splatam {
 namespace avx2 {
 #define SPLATAM_PAIRED 0
+#include "lanes_32.inl"
 #include "lanes.inl"
+#include "projection.inl"
 #include "align.inl"
 #include "kernels.inl"
 }  // namespace avx2

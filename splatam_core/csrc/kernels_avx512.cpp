@@ -11,7 +11,9 @@
 namespace splatam {
 namespace avx512 {
 #define SPLATAM_PAIRED 1
+#include "lanes_32.inl"
 #include "lanes.inl"
+#include "projection.inl"
 #include "align.inl"
 #include "kernels.inl"
 }  // namespace avx512

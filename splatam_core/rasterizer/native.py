@@ -19,7 +19,8 @@ def make_engine(threads: int) -> _native.Engine:
     """Returns what renders and fits isotropic Gaussians. threads: 0 = one per core.
 
     Raises:
-        RasterizerError: the extension is missing or does not fit, or the threads cannot be started.
+        RasterizerError: the extension is missing or does not fit, SPLATAM_ISA names no instruction set, or the threads cannot be
+            started.
     """
     return _made('Engine', threads)
 
@@ -53,6 +54,8 @@ def _made(kind: str, threads: int) -> Any:
     count = _num_threads(threads)
     try:
         return getattr(_extension(), kind)(count)
+    except ValueError as error:
+        raise RasterizerError(str(error)) from None
     except RuntimeError as error:  # std::system_error
         raise RasterizerError(f'{count} threads cannot be started ({error}): set threads to a smaller number') from None
 

@@ -99,15 +99,28 @@ def _assert_equals_reference(rasterizer: Rasterizer, scene: Scene, device: str =
         assert _relative_error(gradients[parameter], gradient) < GRADIENT_TOLERANCE, parameter
 
 
+@pytest.mark.parametrize('name', ['odd size', 'smaller than a tile', 'many, deep', 'behind the camera', 'opaque', 'huge', 'tiny'])
 @pytest.mark.parametrize('isa', ['generic', 'avx2', 'avx512'])
-def test_every_instruction_set_equals_reference(isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the processor has it: the run-time choice must not change the image."""
+def test_every_instruction_set_equals_reference(isa: str, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the processor has it: the run-time choice must not change image, gradients, fit or update.
+
+    Alignment: ``test_torch_aligner.py``.
+    """
     monkeypatch.setenv('SPLATAM_ISA', isa)
     rasterizer = CpuRasterizer(1)
     if rasterizer.instruction_set != isa:
         pytest.skip(f'this processor runs {rasterizer.instruction_set}, not {isa}')
-    _assert_equals_reference(rasterizer, SCENES['odd size'])
-    _assert_fits_like_the_reference(rasterizer, SCENES['odd size'])
+    _assert_equals_reference(rasterizer, SCENES[name])
+    if name in FITTED:
+        _assert_fits_like_the_reference(rasterizer, SCENES[name])
+
+
+@pytest.mark.parametrize('isa', ['avx3', 'AVX2', 'neon'])
+def test_an_unknown_instruction_set_is_one_line(isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv('SPLATAM_ISA', isa)
+    for make in (lambda: make_rasterizer('cpu', 1), lambda: native.make_native_aligner(1)):
+        with pytest.raises(RasterizerError, match=f"SPLATAM_ISA is '{isa}'; expected generic, avx2 or avx512"):
+            make()
 
 
 def test_a_missing_native_module_is_said_where_it_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
