@@ -15,7 +15,7 @@ FUZZ_MINUTES ?= 10
 export SPLATAM_DATA ?= $(abspath ../shared/data)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup test test-quick fuzz fuzz-long sanitize sanitize-threads lint format docs hooks tf2_msgs demo paper-tables colcon check-aarch64 test-aarch64 wheels clean
+.PHONY: help setup test test-quick fuzz fuzz-long sanitize sanitize-threads lint format docs hooks tf2_msgs lpips demo paper-tables colcon check-aarch64 test-aarch64 wheels clean
 
 help:
 	@echo 'make setup           create $(VENV), build the native code and install the package (PYTHON=python3.11 chooses the interpreter)'
@@ -30,6 +30,7 @@ help:
 	echo 'make docs            build the documentation site in build/site and check its links'
 	echo 'make hooks           run the checks of pre-commit at every git commit'
 	echo 'make tf2_msgs        build the messages of /tf into $(VENV), for a ROS that pip installed, which lacks them'
+	echo 'make lpips           download the weights of the LPIPS score into $(VENV): 64 MB'
 	echo 'make demo [BAG=path] play a recording into the node and score the result, in out/demo'
 	echo 'make paper-tables    run ablations, metrics and held-out views on the recordings in SPLATAM_DATA: hours; continues where it stopped'
 	echo 'make colcon          build and test as a ROS package, in a temporary workspace'
@@ -138,6 +139,9 @@ docs: setup $(VENV)/.docs
 
 hooks: setup $(VENV)/.docs
 	@$(BIN)/pre-commit install
+
+lpips: setup
+	@$(BIN)/python -m splatam_core.cli lpips-weights
 
 demo: setup
 	@$(BIN)/python -m splatam_ros.demo $(if $(BAG),'$(BAG)')

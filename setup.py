@@ -136,8 +136,8 @@ setup(
         'tqdm>=4.60',
     ],
     extras_require={
+        'dask': ['distributed>=2024.1'],
         'exr': ['OpenEXR>=3.3'],
-        'lpips': ['lpips>=0.1.4'],
         'lint': [
             'clang-format>=19',
             'codespell>=2.4',
@@ -148,6 +148,7 @@ setup(
             'types-tqdm>=4.60',
         ],
         'mesh': ['open3d>=0.18'],
+        'spz': ['gsply>=0.4'],
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
             'pytest>=7',
@@ -155,6 +156,7 @@ setup(
             'hypothesis>=6',
             'OpenEXR>=3.3',
             'pytorch-msssim>=1.0',
+            'distributed>=2024.1',
             f'triton>=3.4; {HAS_TRITON_WHEEL}',  # interprets the GPU kernels on the CPU; CUDA builds of torch include it
         ],
     },

@@ -7,7 +7,7 @@ import logging
 import sys
 from collections.abc import Sequence
 
-from splatam_core.commands import ablations, bench, compare, convert, evaluate, export, refine, render, run
+from splatam_core.commands import ablations, bench, compare, convert, evaluate, export, lpips_weights, refine, render, run
 from splatam_core.commands.shared import EXIT_ERROR, EXIT_INTERRUPTED
 from splatam_core.errors import SplatamError, one_line
 
@@ -21,6 +21,7 @@ COMMANDS = (
     refine.COMMAND,
     export.COMMAND,
     bench.COMMAND,
+    lpips_weights.COMMAND,
 )
 
 

@@ -47,6 +47,14 @@ class ExportError(SplatamError):
     """A map that cannot be brought into the form asked for."""
 
 
+class JobError(SplatamError):
+    """Runs that cannot be started: a package or a cluster is missing."""
+
+
+class WeightsError(SplatamError):
+    """Weights of a network that cannot be fetched, read or kept."""
+
+
 class CheckpointError(SplatamError):
     """A checkpoint that is missing, damaged, or of another run."""
 

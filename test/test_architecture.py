@@ -18,7 +18,11 @@ BAG_READER = 'splatam_core.datasets.bag'  # a package
 EXR_READER = 'splatam_core.datasets.files'
 IMAGE_HEADERS = 'msg_adapters.image_headers'
 TRITON = 'splatam_core.rasterizer.triton'  # a package
-OPTIONAL = {'lpips': 'splatam_core.evaluation.similarity', 'open3d': 'splatam_core.maps.export'}
+OPTIONAL = {
+    'distributed': 'splatam_core.commands.job_runners',
+    'gsply': 'splatam_core.maps.splat',
+    'open3d': 'splatam_core.maps.export',
+}
 MESSAGES = {
     'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'rcl_interfaces', 'rosgraph_msgs',
     'sensor_msgs', 'std_msgs', 'std_srvs', 'tf2_msgs',
@@ -263,7 +267,8 @@ def test_a_cycle_is_seen() -> None:
         ('splatam_core.datasets.bag.storage', 'import rclpy'),
         ('splatam_core.datasets.files', 'import OpenEXR'),
         ('splatam_core.datasets.record3d', 'def f():\n    import OpenEXR'),
-        ('splatam_core.evaluation.similarity', 'import lpips'),
+        ('splatam_core.maps.splat', 'import gsply'),
+        ('splatam_core.commands.job_runners', 'import distributed'),
         ('splatam_core.slam', 'def f():\n    import open3d'),
         ('splatam_core.slam', 'import triton'),
         ('splatam_core.slam', 'from splatam_core.rasterizer.triton.rasterizer import TritonRasterizer'),

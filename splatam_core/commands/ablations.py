@@ -22,6 +22,8 @@ from splatam_core.commands.shared import (
 if TYPE_CHECKING:
     from splatam_core.runs.record import Source
 
+PAGE = 'ablations.html'
+
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_source_arguments(parser)
@@ -32,7 +34,10 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def ablations(args: argparse.Namespace) -> int:
     """Runs the paper's ablations one after another, and prints their table. Finished runs are not repeated."""
-    from splatam_core.evaluation.ablations import is_finished, provenance, table, variant_names, variants
+    from splatam_core.atomic_io import replace_text
+    from splatam_core.evaluation.ablations import COLUMNS, provenance, rows, variant_names, variants
+    from splatam_core.evaluation.report.tables import Table, page
+    from splatam_core.evaluation.variants import is_finished
 
     chosen = variants(args.only or variant_names(), args.preset, args.set)
     source = at_width(source_of(args), chosen[0].config)
@@ -47,7 +52,11 @@ def ablations(args: argparse.Namespace) -> int:
         if run_in_own_process(words, stdout=sys.stderr) != 0:
             say(f'{variant.name} failed; see above')
     title = f'{Path(source.path).name}{_window_text(source)}, preset `{args.preset}`'
-    print(f'{title}; {provenance(folders.values())}; runs: 1.\n\n{table(folders)}')
+    made_by, table = provenance(folders.values()), Table('', COLUMNS, rows(folders))
+    print(f'{title}; {made_by}; runs: 1.\n\n{table.markdown()}')
+    if args.out.is_dir():
+        replace_text(args.out / PAGE, page(f'Ablations of {args.preset}', f'{title}; {made_by}'.replace('`', ''), [table]))
+        say(f'as a page: {args.out / PAGE}')
     return 0
 
 

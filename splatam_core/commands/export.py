@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatam_core.commands.shared import (
     Command,
-    add_run_argument,
+    add_device_argument,
     open_run,
     open_source,
     positive,
@@ -26,18 +26,36 @@ if TYPE_CHECKING:
     from splatam_core.rasterizer import Gaussians
     from splatam_core.runs.record import RunRecord
 
-FORMS = ('gaussians', 'points', 'mesh', 'splatam')
+SUFFIXES = {
+    'gaussians': ('.ply', '.splat', '.spz'),
+    'points': ('.ply',),
+    'mesh': ('.ply',),
+    'splatam': ('.npz',),
+    'grid': ('.yaml',),
+}
+"""The forms of a map, and the files that each is written to."""
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_run_argument(parser)
-    parser.add_argument('file', type=Path, metavar='FILE', help='file to write: .ply, or .npz with --as splatam')
     parser.add_argument(
-        '--as', dest='form', choices=FORMS, default='gaussians',
+        'dir', type=Path, metavar='DIR', help='run folder; for gaussians and points also a map of any program, .ply'
+    )
+    add_device_argument(parser, "device to compute on (default: as the run's settings say)")
+    parser.add_argument(
+        'file', type=Path, metavar='FILE',
+        help='file to write: .ply, .splat or .spz (extra spz); .npz with --as splatam, .yaml with --as grid',
+    )  # fmt: skip
+    parser.add_argument(
+        '--as', dest='form', choices=SUFFIXES, default='gaussians',
         help="'gaussians': for splat viewers (default); 'points': coloured centres; 'mesh': surface fused from rendered depth "
-        "(needs pip install 'splatam_ros[mesh]'); 'splatam': params.npz for the original's programs",
+        "(needs pip install 'splatam_ros[mesh]'); 'splatam': params.npz for the original's programs; 'grid': floor plan for "
+        "ROS' map_server, .yaml and .pgm",
     )  # fmt: skip
     parser.add_argument('--overwrite', action='store_true', help='replace FILE')
+    parser.add_argument(
+        '--sh-degree', type=int, choices=range(4), default=0, metavar='D',
+        help='gaussians, .ply: spherical harmonics up to degree D, zero above 0; some viewers accept only 3 (default: %(default)s)',
+    )  # fmt: skip
     parser.add_argument(
         '--min-opacity',
         type=_number,
@@ -53,9 +71,19 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_number,
         default=6.0,
         metavar='M',
-        help='mesh: ignore depth beyond M metres (default: %(default)s)',
+        help='mesh, grid: ignore depth beyond M metres (default: %(default)s)',
     )
-    parser.add_argument('--every', type=positive, default=5, metavar='N', help='mesh: fuse every n-th frame (default: %(default)s)')
+    parser.add_argument(
+        '--every', type=positive, default=5, metavar='N', help='mesh, grid: look from every n-th frame (default: %(default)s)'
+    )
+    for name, metres, what in (
+        ('resolution', 0.05, 'side of a cell'),
+        ('min-height', 0.1, 'lowest obstacle over the floor'),
+        ('max-height', 1.0, 'highest obstacle over the floor: the height of the robot'),
+    ):
+        parser.add_argument(
+            f'--{name}', type=_number, default=metres, metavar='M', help=f'grid: {what}, metres (default: %(default)s)'
+        )
 
 
 def _number(text: str) -> float:
@@ -67,33 +95,64 @@ def _number(text: str) -> float:
 
 def export(args: argparse.Namespace) -> int:
     """Writes a run's map for other programs."""
-    from splatam_core.maps.export import centres
-    from splatam_core.maps.ply import write_ply, write_surface
     from splatam_core.runs.layout import why_not
 
-    suffix = '.npz' if args.form == 'splatam' else '.ply'
-    if args.file.suffix.lower() != suffix:
-        raise ExportError(f"{args.file}: '{args.file.suffix}' files are not written; name it {suffix}")
+    suffixes = SUFFIXES[args.form]
+    if args.file.suffix.lower() not in suffixes:
+        raise ExportError(f"{args.file}: '{args.file.suffix}' files are not written; name it {' or '.join(suffixes)}")
     if os.path.lexists(args.file) and not args.overwrite:
         raise ExportError(f'{args.file} exists: choose another name, or replace it with --overwrite')
-    run = open_run(args.dir, args.device)
-    gaussians = run.read_map()
     try:
-        if args.form == 'gaussians':
-            write_ply(args.file, gaussians)
-            print(f'{len(gaussians)} Gaussians are in {args.file}')
-            return 0
-        if args.form == 'splatam':
-            _write_splatam(args.file, run, gaussians)
-            print(f'{len(gaussians)} Gaussians and {len(run.trajectory)} poses are in {args.file}')
-            return 0
-        surface = centres(gaussians, args.min_opacity) if args.form == 'points' else _mesh(args, run, gaussians)
-        write_surface(args.file, surface.points_m, surface.rgb, surface.triangles)
+        print(f'{_write(args)} are in {args.file}')
     except OSError as error:
         raise ExportError(f'{args.file}: cannot be written: {why_not(error)}') from None
-    faces = '' if surface.triangles is None else f' and {len(surface.triangles)} triangles'
-    print(f'{len(surface.points_m)} points{faces} are in {args.file}')
     return 0
+
+
+def _write(args: argparse.Namespace) -> str:
+    """Writes the file. Returns what is in it, for the user."""
+    if os.path.isfile(args.dir):
+        if args.form not in ('gaussians', 'points'):
+            raise ExportError(f'{args.dir} is a file: --as {args.form} needs a run folder, for its camera and poses')
+        from splatam_core.maps.ply import read_ply
+
+        return _write_map(args, read_ply(args.dir))
+    run = open_run(args.dir, args.device)
+    gaussians = run.read_map()
+    if args.form == 'splatam':
+        _write_splatam(args.file, run, gaussians)
+        return f'{len(gaussians)} Gaussians and {len(run.trajectory)} poses'
+    if args.form == 'grid':
+        return _write_grid(args, run, gaussians)
+    if args.form == 'mesh':
+        return _write_surface(args.file, _mesh(args, run, gaussians))
+    return _write_map(args, gaussians)
+
+
+def _write_map(args: argparse.Namespace, gaussians: Gaussians) -> str:
+    """Writes Gaussians or their centres."""
+    from splatam_core.maps.export import centres
+    from splatam_core.maps.ply import write_ply
+    from splatam_core.maps.splat import write_splat, write_spz
+
+    if args.form == 'points':
+        return _write_surface(args.file, centres(gaussians, args.min_opacity))
+    kind = args.file.suffix.lower()
+    if kind != '.ply' and args.sh_degree:
+        raise ExportError(f'{args.file}: --sh-degree is for .ply files; {kind} files are read without it')
+    if kind == '.ply':
+        write_ply(args.file, gaussians, sh_degree=args.sh_degree)
+    else:
+        {'.splat': write_splat, '.spz': write_spz}[kind](args.file, gaussians)
+    return f'{len(gaussians)} Gaussians'
+
+
+def _write_surface(path: Path, surface: Surface) -> str:
+    from splatam_core.maps.ply import write_surface
+
+    write_surface(path, surface.points_m, surface.rgb, surface.triangles)
+    faces = '' if surface.triangles is None else f' and {len(surface.triangles)} triangles'
+    return f'{len(surface.points_m)} points{faces}'
 
 
 def _mesh(args: argparse.Namespace, run: RunRecord, gaussians: Gaussians) -> Surface:
@@ -105,6 +164,25 @@ def _mesh(args: argparse.Namespace, run: RunRecord, gaussians: Gaussians) -> Sur
         gaussians.to(device), rasterizer, run.camera_or_error(), run.trajectory.T_world_cam[:: args.every],
         voxel_m=args.voxel, max_depth_m=args.max_depth, progress=progress('fusing', 'view'),
     )  # fmt: skip
+
+
+def _write_grid(args: argparse.Namespace, run: RunRecord, gaussians: Gaussians) -> str:
+    from splatam_core.maps.grid import OCCUPIED, GridSettings, find_floor, grid_of, rendered_views, write_map_server
+    from splatam_core.rasterizer import rasterizer_for
+
+    if args.min_height >= args.max_height:
+        raise ExportError(f'--min-height {args.min_height:g} is not below --max-height {args.max_height:g}')
+    settings = GridSettings(args.resolution, args.min_height, args.max_height, args.max_depth)
+    picture = args.file.with_suffix('.pgm')
+    if os.path.lexists(picture) and not args.overwrite:
+        raise ExportError(f'{picture} exists: choose another name, or replace it with --overwrite')
+    (rasterizer, device), camera = rasterizer_for(run.config), run.camera_or_error()
+    poses = run.trajectory.T_world_cam[:: args.every]
+    views = rendered_views(gaussians.to(device), rasterizer, camera, poses, progress('rendering', 'view'))
+    grid = grid_of(views, camera, find_floor(views, camera, settings.range_m), settings)
+    write_map_server(args.file, grid)
+    rows, columns = grid.cells.shape
+    return f'{columns}x{rows} cells of {settings.resolution_m:g} m, {int((grid.cells == OCCUPIED).sum())} of them occupied,'
 
 
 def _write_splatam(path: Path, run: RunRecord, gaussians: Gaussians) -> None:
@@ -138,5 +216,8 @@ def _true_poses(run: RunRecord) -> NDArray[np.float64]:
 
 
 COMMAND = Command(
-    'export', "write a run's map as Gaussians, points or a mesh, or for the original's programs", _add_arguments, export
+    'export',
+    "write a run's map as Gaussians, points, a mesh or a floor plan, or for the original's programs",
+    _add_arguments,
+    export,
 )

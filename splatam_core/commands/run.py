@@ -39,7 +39,7 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_source_arguments(parser, optional=True)
+    add_source_arguments(parser, nargs='?')
     add_preset_arguments(parser)
     add_device_argument(parser, 'device to compute on; same as --set device=D, and allowed with --resume')
     parser.add_argument('--out', type=Path, metavar='DIR', help='folder for the results')

@@ -6,7 +6,7 @@ import argparse
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
@@ -16,7 +16,7 @@ from splatam_core.errors import SplatamError
 
 if TYPE_CHECKING:
     from splatam_core.config import SlamConfig
-    from splatam_core.datasets.base import Sequence
+    from splatam_core.datasets.base import Sequence as FrameSequence
     from splatam_core.geometry.trajectory import Trajectory
     from splatam_core.runs.record import RunRecord, Source
 
@@ -45,12 +45,17 @@ class Command:
     run: Callable[[argparse.Namespace], int]
 
 
-def add_source_arguments(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
-    """Adds SOURCE and how to read it."""
+def add_source_arguments(parser: argparse.ArgumentParser, *, nargs: str | None = None) -> None:
+    """Adds SOURCE and how to read it.
+
+    Args:
+        parser: gets the arguments.
+        nargs: how many sources are given: None = one, '?' = one or none, '+' = any number, all read alike.
+    """
     parser.add_argument(
         'source',
         metavar='SOURCE',
-        nargs='?' if optional else None,
+        nargs=nargs,
         help='dataset folder, bag (folder, .db3, .mcap, ROS 1 .bag), synthetic[:seed=0,...]',
     )
     parser.add_argument('--format', metavar='F', help='reader of SOURCE (default: found from its files)')
@@ -92,13 +97,18 @@ def add_device_argument(parser: argparse.ArgumentParser, help: str) -> None:
     parser.add_argument('--device', choices=DEVICES, help=help)
 
 
-def source_of(args: argparse.Namespace) -> Source:
-    """Returns the recording that the arguments name."""
+def source_of(args: argparse.Namespace, path: str | None = None) -> Source:
+    """Returns the recording that the arguments name.
+
+    Args:
+        args: of ``add_source_arguments``.
+        path: one of several recordings; None = the only one.
+    """
     from splatam_core.runs.record import Source
 
-    path = str(Path(args.source).resolve()) if os.path.exists(args.source) else args.source  # False for impossible names, too
+    path = args.source if path is None else path
     return Source(
-        path=path,
+        path=str(Path(path).resolve()) if os.path.exists(path) else path,  # False for impossible names, too
         format=args.format,
         start=args.start,
         max_frames=args.max_frames,
@@ -145,7 +155,7 @@ def source_words(source: Source) -> list[str]:
     return [source.path, *words, *(name for name, is_given in switches.items() if is_given)]
 
 
-def open_source(source: Source) -> Sequence:
+def open_source(source: Source) -> FrameSequence:
     """Opens a recording.
 
     Raises:
@@ -171,7 +181,7 @@ def open_source(source: Source) -> Sequence:
     )
 
 
-def usable_ground_truth(sequence: Sequence) -> Trajectory | None:
+def usable_ground_truth(sequence: FrameSequence) -> Trajectory | None:
     """Returns the true poses of a recording; None if it has none. A fault in them is said, and costs nothing but them."""
     try:
         return sequence.ground_truth()
@@ -214,6 +224,26 @@ def run_in_own_process(arguments: Iterable[object], stdout: IO[str] | None = Non
     if code == EXIT_INTERRUPTED:
         raise KeyboardInterrupt
     return code
+
+
+def process_that_ends_with_this(arguments: Sequence[str]) -> list[str]:
+    """Returns a command line of ``splatam`` for a process that Linux kills when this one ends, however it ends.
+
+    Args:
+        arguments: the words after ``splatam``.
+    """
+    return [sys.executable, '-c', _END_WITH_PARENT, str(os.getpid()), *arguments]
+
+
+_END_WITH_PARENT = """
+import ctypes, os, signal, sys
+if sys.platform == 'linux':
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+if os.getppid() != int(sys.argv[1]):
+    sys.exit('the process that started this one has ended')
+from splatam_core.cli import main
+sys.exit(main(sys.argv[2:]))
+"""
 
 
 def positive(text: str) -> int:

@@ -6,45 +6,19 @@ Each variant is one run of ``splatam run``.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-from splatam_core.config import SlamConfig, load_config, parse_overrides, read_values
+from splatam_core.config import parse_overrides, read_values
 from splatam_core.errors import ConfigError, RunFolderError
+from splatam_core.evaluation.variants import Variant
 from splatam_core.resources import config_dir
 from splatam_core.runs.layout import METRICS, RUN
 from splatam_core.runs.metrics import Metrics
-from splatam_core.runs.record import RunSettings, Source, read_run, read_settings
+from splatam_core.runs.record import RunSettings, read_settings
 from splatam_core.text_files import read_text
 
 FULL = 'full'
-
-
-@dataclass(frozen=True, slots=True)
-class Variant:
-    """One run of a set.
-
-    Attributes:
-        name: of its file, and of its run folder.
-        preset: the preset it starts from.
-        overrides: dotted names to values, applied on top of the preset.
-    """
-
-    name: str
-    preset: str
-    overrides: Mapping[str, object]
-
-    @property
-    def config(self) -> SlamConfig:
-        """All its settings."""
-        return load_config(self.preset, self.overrides)
-
-    def words(self) -> list[str]:
-        """Returns its settings as arguments of ``splatam run``."""
-        settings = [word for name, value in self.overrides.items() for word in ('--set', f'{name}={json.dumps(value)}')]
-        return ['--preset', self.preset, *settings]
 
 
 def variant_names() -> list[str]:
@@ -77,30 +51,11 @@ def _variant(name: str, known: Sequence[str], preset: str, overrides: dict[str, 
     return variant
 
 
-def is_finished(variant: Variant, source: Source, folder: Path) -> bool:
-    """Returns True if the folder holds the variant's run, with scores.
-
-    Args:
-        variant: whose run.
-        source: the recording it must be of.
-        folder: of the run.
-
-    Raises:
-        RunFolderError: the folder holds another run.
-    """
-    if not (folder / RUN).is_file():
-        return False
-    record = read_run(folder)
-    if record.config != variant.config or record.description.source != source:
-        raise RunFolderError(f'{folder} holds a run with other settings or of another recording: choose another --out')
-    return (folder / METRICS).is_file() and record.metrics().psnr_db is not None
-
-
 COLUMNS = 'variant', 'tracked', 'ATE RMSE cm', 'depth L1 cm', 'PSNR dB', 'SSIM', 'Gaussians', 's/frame'
 
 
-def table(folders: Mapping[str, Path]) -> str:
-    """Returns the scores of runs as a Markdown table; a run without results is a row of dashes.
+def rows(folders: Mapping[str, Path]) -> list[tuple[str, ...]]:
+    """Returns the scores of runs as rows of a table with ``COLUMNS``; a run without results is a row of dashes.
 
     Args:
         folders: name of a variant to its run folder.
@@ -108,8 +63,7 @@ def table(folders: Mapping[str, Path]) -> str:
     Raises:
         RunFolderError: the numbers of a run are damaged.
     """
-    lines = [COLUMNS, ('---',) * len(COLUMNS), *(_row(name, folder) for name, folder in folders.items())]
-    return '\n'.join('| ' + ' | '.join(cells) + ' |' for cells in lines)
+    return [_row(name, folder) for name, folder in folders.items()]
 
 
 def _row(name: str, folder: Path) -> tuple[str, ...]:

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from splatam_core.datasets.base import Sequence, frame_or_none
 from splatam_core.errors import RunFolderError
 from splatam_core.evaluation.images import FrameScores, ViewScorer
+from splatam_core.evaluation.lpips import MIN_SIDE as LPIPS_MIN_SIDE
+from splatam_core.evaluation.lpips import Lpips, load_lpips
 from splatam_core.evaluation.results import ImageEvaluation, NovelViews, Sample, TrajectoryEvaluation
-from splatam_core.evaluation.similarity import LPIPS_MIN_SIDE, MIN_SIDE, Lpips, load_lpips
+from splatam_core.evaluation.similarity import MIN_SIDE
 from splatam_core.evaluation.trajectory import (
     align_poses,
     relative_pose_errors,
@@ -166,7 +168,7 @@ def make_scorer(run: RunRecord, lpips: Lpips | str) -> ViewScorer:
     """
     rasterizer, device = rasterizer_for(run.config)
     gaussians = run.read_map().to(device)
-    return ViewScorer(gaussians, rasterizer, run.config.depth, lpips if isinstance(lpips, Lpips) else None)
+    return ViewScorer(gaussians, rasterizer, run.config.depth, lpips.to(device) if isinstance(lpips, Lpips) else None)
 
 
 def _stamps_to_score(run: RunRecord, every: int) -> tuple[set[int], set[int]]:

@@ -1,11 +1,6 @@
-"""Perceptual similarity of whole images: MS-SSIM, and LPIPS if its package and weights are installed."""
+"""MS-SSIM: structural similarity of whole images at several scales."""
 
 from __future__ import annotations
-
-import contextlib
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,10 +16,6 @@ WINDOW_MARGIN = 5
 
 MIN_SIDE = 161
 """Pixels. In smaller images the window does not fit into the coarsest scale."""
-
-LPIPS_NETWORK = 'alex'
-LPIPS_MIN_SIDE = 31
-"""Pixels. In smaller images nothing is left after AlexNet's second pooling."""
 
 
 def ms_ssim(a: Tensor, b: Tensor) -> float | None:
@@ -62,44 +53,3 @@ def _halved(image: Tensor) -> Tensor:
 
 def _inside(values: Tensor) -> Tensor:
     return values[:, WINDOW_MARGIN:-WINDOW_MARGIN, WINDOW_MARGIN:-WINDOW_MARGIN]
-
-
-@dataclass(frozen=True, slots=True)
-class Lpips:
-    """LPIPS with AlexNet.
-
-    Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018.
-
-    Attributes:
-        network: an ``lpips.LPIPS`` module.
-    """
-
-    network: Any
-
-    def __call__(self, a: Tensor, b: Tensor) -> float | None:
-        """Return the distance of two [3, H, W] images in [0, 1]; None if they are too small."""
-        if min(a.shape[-2:]) < LPIPS_MIN_SIDE:
-            return None
-        with torch.no_grad():
-            return float(self.network.to(a.device)(a[None], b[None], normalize=True))
-
-
-@lru_cache(maxsize=1)
-def load_lpips() -> Lpips | str:
-    """Return LPIPS, or a message that says why it is not available."""
-    try:
-        import lpips
-    except ImportError as error:
-        return f"{error}: pip install 'splatam_ros[lpips]', with the torchvision that fits the installed torch"
-    except RuntimeError as error:  # torchvision built for another torch
-        return f'torchvision does not fit the installed torch: {_first_line(error)}'
-    try:
-        with contextlib.redirect_stdout(None):  # torchvision prints that it downloads
-            network = lpips.LPIPS(net=LPIPS_NETWORK, verbose=False)
-    except (OSError, RuntimeError) as error:
-        return f'the weights of AlexNet cannot be loaded: {_first_line(error)}'
-    return Lpips(network.eval())
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -7,10 +7,7 @@ quaternion w x y z. An isotropic Gaussian repeats its scale and has the identity
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import torch
@@ -18,18 +15,28 @@ from numpy.typing import NDArray
 
 from splatam_core.atomic_io import open_regular, replaced
 from splatam_core.errors import MapFileError, one_line
+from splatam_core.maps.ply_file import read_vertices
 from splatam_core.rasterizer import Gaussians
 from splatam_core.rasterizer.base import HUGE, MIN_QUATERNION
 
 SH_C0 = 0.28209479177387814
 """Value of the zeroth spherical harmonic, 1 / (2 sqrt(pi))."""
 
+CENTRE = ('x', 'y', 'z')
 NORMALS = ('nx', 'ny', 'nz')
+F_DC = ('f_dc_0', 'f_dc_1', 'f_dc_2')
 SCALES = ('scale_0', 'scale_1', 'scale_2')
 RGB = ('red', 'green', 'blue')
 ROTATION = ('rot_0', 'rot_1', 'rot_2', 'rot_3')
-REQUIRED = ('x', 'y', 'z', 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', *SCALES)
-PROPERTIES = ('x', 'y', 'z', *NORMALS, 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', *SCALES, *ROTATION)
+
+ALIASES = {
+    'scale_0': ('scale_x', 'scale'), 'scale_1': ('scale_y',), 'scale_2': ('scale_z',),
+    'rot_0': ('rot_w',), 'rot_1': ('rot_x',), 'rot_2': ('rot_y',), 'rot_3': ('rot_z',),
+}  # fmt: skip
+"""Other names that programs give to a property."""
+
+REQUIRED = (*((name,) for name in CENTRE), ('opacity',), ('scale_0', *ALIASES['scale_0']))
+"""Names of properties that a map must have beside colours, of each group one."""
 
 COMMENTS = (
     'Gaussian map of splatam_ros',
@@ -37,36 +44,65 @@ COMMENTS = (
     "a pixel's centre is its integer index: u = fx x/z + cx",
 )
 
-_SCALAR_TYPES = {
-    'char': 'i1', 'int8': 'i1', 'uchar': 'u1', 'uint8': 'u1', 'short': 'i2', 'int16': 'i2', 'ushort': 'u2',
-    'uint16': 'u2', 'int': 'i4', 'int32': 'i4', 'uint': 'u4', 'uint32': 'u4', 'float': 'f4', 'float32': 'f4',
-    'double': 'f8', 'float64': 'f8',
-}  # fmt: skip
-_MAX_HEADER_BYTES = 65536
+OPAQUE = 20.0
+"""Logit of an opacity that differs from 1 by 2e-9, which no rasterizer tells from 1."""
+
+POINT = -20.0
+"""Log radius of 2 nm: a Gaussian without extent, drawn as the blur of a pixel."""
+
 _LARGEST = HUGE / SH_C0
 """Of a value in a file: a colour of ``HUGE`` is stored as this coefficient."""
 
 
-def write_ply(path: Path, gaussians: Gaussians) -> None:
+def properties(sh_degree: int = 0) -> tuple[str, ...]:
+    """Return the names of a Gaussian's properties in the order of the original 3D Gaussian splatting exporter.
+
+    Args:
+        sh_degree: of the spherical harmonics, 0 to 3; 0 has no view-dependent colour.
+    """
+    rest = (f'f_rest_{index}' for index in range(3 * ((sh_degree + 1) ** 2 - 1)))
+    return (*CENTRE, *NORMALS, *F_DC, *rest, 'opacity', *SCALES, *ROTATION)
+
+
+PROPERTIES = properties()
+
+
+def write_ply(path: Path, gaussians: Gaussians, *, sh_degree: int = 0) -> None:
     """Write a map. An existing file is replaced only when the new one is complete.
+
+    Args:
+        path: the file to write.
+        gaussians: the map.
+        sh_degree: of the spherical harmonics in the file, 0 to 3. Those above 0 are zero: they are for viewers that accept
+            nothing else.
 
     Raises:
         MapFileError: a Gaussian is one that ``read_ply`` would refuse; nothing is written.
         OSError: the file cannot be written.
     """
-    if num_broken := len(gaussians) - int(gaussians.usable().sum()):
-        raise MapFileError(f'{path}: {num_broken} of {len(gaussians)} Gaussians are not finite, so the map is not written')
+    check_usable(path, gaussians)
     columns = _columns(gaussians)
-    rows = np.zeros(len(gaussians), dtype=[(name, '<f4') for name in PROPERTIES])
+    names = properties(sh_degree)
+    rows = np.zeros(len(gaussians), dtype=[(name, '<f4') for name in names])
     for name, column in columns.items():
         rows[name] = column
     header = [
         'ply', 'format binary_little_endian 1.0', *(f'comment {line}' for line in COMMENTS),
-        f'element vertex {len(rows)}', *(f'property float {name}' for name in PROPERTIES), 'end_header', '',
+        f'element vertex {len(rows)}', *(f'property float {name}' for name in names), 'end_header', '',
     ]  # fmt: skip
     with replaced(path) as temporary, temporary.open('wb') as file:
         file.write('\n'.join(header).encode('ascii'))
         file.write(rows.tobytes())
+
+
+def check_usable(path: Path, gaussians: Gaussians) -> None:
+    """Check that every Gaussian can be written.
+
+    Raises:
+        MapFileError: one is not finite, or its quaternion has no length.
+    """
+    if num_broken := len(gaussians) - int(gaussians.usable().sum()):
+        raise MapFileError(f'{path}: {num_broken} of {len(gaussians)} Gaussians are not finite, so the map is not written')
 
 
 def _columns(gaussians: Gaussians) -> dict[str, NDArray[np.float64]]:
@@ -74,8 +110,7 @@ def _columns(gaussians: Gaussians) -> dict[str, NDArray[np.float64]]:
     means, rgb, logits, log_scales = (
         tensor.cpu().numpy().astype(np.float64) for tensor in (g.means, g.rgb, g.logit_opacities, g.log_scales)
     )
-    columns = dict(zip('xyz', means.T))
-    columns |= {f'f_dc_{c}': (rgb[:, c] - 0.5) / SH_C0 for c in range(3)}
+    columns = dict(zip(CENTRE, means.T)) | dict(zip(F_DC, (rgb.T - 0.5) / SH_C0))
     columns |= {'opacity': logits, 'rot_0': np.ones(len(means))}
     if g.rotations is not None:
         columns |= dict(zip(ROTATION, g.rotations.cpu().numpy().astype(np.float64).T))
@@ -113,96 +148,81 @@ def write_surface(
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Read a map.
+    """Read a map of this or another program.
 
-    Higher spherical-harmonics coefficients (view-dependent colour) are ignored.
+    The properties may come in any order and as numbers of any type, as text or binary. Colour is ``f_dc_0`` to ``f_dc_2``,
+    or ``red``, ``green`` and ``blue`` as bytes. Rotations are w x y z, of any length. Higher spherical-harmonics coefficients
+    (view-dependent colour) and all other properties are ignored.
 
     Returns:
-        float32 tensors. The map is isotropic if the three scales of every Gaussian are equal, else anisotropic.
+        float32 tensors. The map is isotropic if it has one scale, or if the three scales of every Gaussian are equal; else
+        anisotropic.
 
     Raises:
         MapFileError: the file cannot be read, is not a PLY file in this layout, is cut short, holds a number that is
-            not finite, or holds anisotropic Gaussians without rotations.
+            not finite (but infinite opacities and sizes of zero are limited), or holds anisotropic Gaussians without rotations.
     """
     try:
         with open_regular(path) as file:
-            header = _read_header(file)
-            rows = _read_rows(file, header)
+            rows = read_vertices(file, REQUIRED)
+        names = _names(rows.dtype)
     except OSError as error:
         raise MapFileError(f'{path}: cannot be read: {error.strerror}') from None
     except MemoryError:
         raise MapFileError(f'{path}: cannot be read: it does not fit into memory') from None
     except (ValueError, TypeError) as error:
         raise MapFileError(f'{path}: {one_line(error)}') from None
-    is_anisotropic = any((rows[SCALES[0]] != rows[other]).any() for other in SCALES[1:])
-    names = [*REQUIRED, *(name for name in ROTATION if is_anisotropic and name in header.names)]
+    scales = [name for name in SCALES if name in names]
+    is_anisotropic = any((rows[names[SCALES[0]]] != rows[names[other]]).any() for other in scales[1:])
+    needed = [*CENTRE, *(F_DC if F_DC[0] in names else RGB), 'opacity', *(SCALES if is_anisotropic else SCALES[:1])]
+    needed += [name for name in ROTATION if is_anisotropic and name in names]
     with np.errstate(over='ignore'):  # a double that does not fit becomes infinite, and is refused below
-        values = {name: rows[name].astype(np.float32) for name in names}
+        values = {name: rows[names[name]].astype(np.float32) for name in needed}
+    _limit_infinite(values)
     _check_values(path, values)
     if is_anisotropic:
         _check_rotations(path, values)
     return Gaussians(
-        means=_tensor(values, ('x', 'y', 'z')),
+        means=_tensor(values, CENTRE),
         log_scales=_tensor(values, SCALES if is_anisotropic else SCALES[:1]),
         logit_opacities=torch.from_numpy(values['opacity']),
-        rgb=_tensor(values, ('f_dc_0', 'f_dc_1', 'f_dc_2')) * SH_C0 + 0.5,
+        rgb=_tensor(values, F_DC) * SH_C0 + 0.5 if F_DC[0] in values else _tensor(values, RGB) / 255,
         rotations=_tensor(values, ROTATION) if is_anisotropic else None,
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Header:
-    """The number of Gaussians and the layout of one of them."""
+def _names(row: np.dtype) -> dict[str, str]:
+    """Return the names in a file by the names that this module uses.
 
-    count: int
-    row: np.dtype
+    Args:
+        row: the layout of the file's vertices.
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the properties."""
-        return self.row.names or ()
-
-
-def _read_header(file: BinaryIO) -> _Header:
-    if file.readline(_MAX_HEADER_BYTES).rstrip() != b'ply':
-        raise ValueError("not a PLY file: it does not start with 'ply'")
-    lines = []
-    while (line := file.readline(_MAX_HEADER_BYTES)).rstrip() != b'end_header':
-        if not line.endswith(b'\n') or file.tell() > _MAX_HEADER_BYTES:
-            raise ValueError("the header has no 'end_header': the file is damaged or is not a PLY file")
-        lines.append(line.decode('ascii', errors='replace').split())
-    return _parse_header([words for words in lines if words and words[0] not in ('comment', 'obj_info')])
-
-
-def _parse_header(lines: list[list[str]]) -> _Header:
-    kind = ' '.join(lines[0]) if lines else ''
-    if kind != 'format binary_little_endian 1.0':
-        raise ValueError(f"'{kind}' is not supported: only format binary_little_endian 1.0 is read")
-    if len(lines) < 2 or lines[1][:2] != ['element', 'vertex'] or len(lines[1]) != 3:
-        raise ValueError("the first element must be 'vertex' (one vertex per Gaussian)")
-    if not lines[1][2].isdecimal():
-        raise ValueError(f"'{lines[1][2]}' is not a number of vertices")
-    properties = []
-    for words in lines[2:]:
-        if words[0] == 'element':  # faces and the like follow the vertices and are not needed
-            break
-        if len(words) != 3 or words[0] != 'property' or words[1] not in _SCALAR_TYPES:
-            raise ValueError(f"header line '{' '.join(words)}' is not a scalar property of a vertex")
-        properties.append((words[2], '<' + _SCALAR_TYPES[words[1]]))
-    names = [name for name, _ in properties]
-    if missing := [name for name in REQUIRED if name not in names]:
-        raise ValueError(f'property {", ".join(missing)} is missing: this is not a map in the 3D Gaussian splatting layout')
-    return _Header(int(lines[1][2]), np.dtype(properties))  # a duplicate name raises ValueError here
+    Raises:
+        ValueError: the file has a part of the colours or of the scales only, or colours that are neither coefficients nor bytes.
+    """
+    present = row.names or ()
+    names = {name: name for name in present}
+    for name, others in ALIASES.items():
+        found = next((other for other in (name, *others) if other in present), None)
+        if found is not None:
+            names[name] = found
+    colours = RGB if set(RGB) & set(names) and not set(F_DC) & set(names) else F_DC
+    if missing := [name for name in colours if name not in names]:
+        raise ValueError(f'property {", ".join(missing)} is missing: a colour needs three')
+    if colours == RGB and (wrong := [name for name in RGB if row[name] != np.uint8]):
+        raise ValueError(f'property {", ".join(wrong)} is {row[wrong[0]]}: colours are read as f_dc_0 to f_dc_2, or as uchar')
+    if len(given := [name for name in SCALES if name in names]) == 2:
+        raise ValueError(f'the map has {" and ".join(given)} only: flat Gaussians (2D Gaussian splatting) are not read')
+    return names
 
 
-def _read_rows(file: BinaryIO, header: _Header) -> NDArray[np.void]:
-    available = os.fstat(file.fileno()).st_size - file.tell()
-    needed = header.count * header.row.itemsize
-    if available < needed:
-        raise ValueError(
-            f'{header.count} Gaussians need {needed} bytes but only {available} follow the header: the file is cut short'
-        )
-    return np.fromfile(file, dtype=header.row, count=header.count)
+def _limit_infinite(values: dict[str, NDArray[np.float32]]) -> None:
+    """Makes infinite opacities and sizes of zero finite: files that were converted from 8 bits have them."""
+    opacities = values['opacity']
+    opacities[np.isinf(opacities)] = np.copysign(OPAQUE, opacities[np.isinf(opacities)])
+    for name in SCALES:
+        if name in values:
+            values[name][np.isneginf(values[name])] = POINT
 
 
 def _check_values(path: Path, values: dict[str, NDArray[np.float32]]) -> None:

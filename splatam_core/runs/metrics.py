@@ -32,7 +32,7 @@ class ImageScores:
         psnr_full_db: of the colour over the whole image, holes included.
         depth_rmse_m: root of the mean squared difference to the reading.
         ms_ssim: of whole images; None where they are too small for it.
-        lpips: of whole images; None where the package is not installed.
+        lpips: of whole images; None where its weights are not installed.
     """
 
     psnr_db: float | None = None

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,14 +12,13 @@ import pytest
 import torch
 
 from splatam_core.cli import main
-from splatam_core.config import load_config
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.geometry import se3
 from splatam_core.geometry.trajectory import pose_line
 from splatam_core.maps.ply import read_ply
 from splatam_core.rasterizer import make_rasterizer
 from splatam_core.runs.metrics import Metrics
-from splatam_core.runs.record import RunRecord, Source, read_run
+from splatam_core.runs.record import RunRecord, read_run
 
 WIDTH, FRAMES, HOLD_OUT = 64, 6, 3
 SOURCE = ['synthetic', '--width', WIDTH, '--max-frames', FRAMES]
@@ -112,13 +109,13 @@ def test_novel_views_need_a_test_split(finished: Path, capsys: pytest.CaptureFix
     assert (finished / 'metrics.json').read_bytes() == before
 
 
-# --- compare, bench ---
+# --- compare ---
 
 
 def test_compare_prints_a_table_and_draws(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = Path(shutil.copytree(finished, tmp_path / 'other'))
     (other / 'metrics.json').unlink()  # as after a run that was killed
-    assert splatam('compare', finished, other, '--plot', tmp_path / 'plot.png') == 0
+    assert splatam('compare', finished, other, '--plot', tmp_path / 'plot.png', '--html', tmp_path / 'page.html') == 0
     common, _, head, _, *rows = capsys.readouterr().out.splitlines()[:6]
     assert common.startswith('synthetic; commit') and 'cores' in common
     columns = [cell.strip() for cell in head.strip('|').split('|')]
@@ -129,6 +126,9 @@ def test_compare_prints_a_table_and_draws(finished: Path, tmp_path: Path, capsys
     assert table[1]['ATE RMSE cm'] == '\u2013' and table[1]['tracked'] == f'{FRAMES}/{FRAMES}'
     assert 'MS-SSIM' not in columns  # no run has it
     assert cv2.imread(str(tmp_path / 'plot.png')).std() > 20
+    page = (tmp_path / 'page.html').read_text()
+    assert f'<td class="n">{100 * metrics(finished).ate_rmse_m:.3f}</td>' in page and 'data:image/png;base64,' in page
+    assert 'href="other/report.html"' in page  # relative to the page
 
 
 def test_compare_of_equal_names_shows_their_paths(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -137,47 +137,12 @@ def test_compare_of_equal_names_shows_their_paths(finished: Path, tmp_path: Path
     assert str(same) in capsys.readouterr().out and (tmp_path / 'plot.svg').read_text().startswith('<?xml')
 
 
-@pytest.mark.parametrize(('plot', 'message'), [('a.jpg', "'.jpg' is not one of"), ('no/a.png', 'cannot be written')])
+@pytest.mark.parametrize(('plot', 'message'), [('a.jpg', "'.jpg' is not one of"), ('no/a.png', 'no/a.png: cannot be written')])
 def test_compare_refuses_what_it_cannot_draw(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], plot: str, message: str
 ) -> None:
     assert splatam('compare', finished, '--plot', tmp_path / plot) == 2
     assert message in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_bench_runs_presets_and_compares_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def here(command: list[str], stdout: object, check: bool) -> subprocess.CompletedProcess[str]:
-        """Runs in this process, because importing the libraries takes longer than the run."""
-        assert command[:3] == [sys.executable, '-m', 'splatam_core.cli'] and stdout is None and not check
-        return subprocess.CompletedProcess(command, main(command[3:]))
-
-    monkeypatch.setattr('splatam_core.commands.shared.subprocess', SimpleNamespace(run=here))
-    few = ['synthetic', '--width', 32, '--start', 1, '--max-frames', 3, *FAST]
-    assert splatam('bench', *few, '--presets', 'quick,realtime', '--out', tmp_path / 'b') == 0
-    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith(('| quick', '| realtime'))]
-    assert [row.split('|')[1].strip() for row in rows] == ['quick', 'realtime']
-    assert {entry.name for entry in (tmp_path / 'b').iterdir()} == {'quick', 'realtime', 'compare.png'}
-    for preset in ('quick', 'realtime'):
-        bench = read_run(tmp_path / 'b' / preset)
-        assert bench.config == load_config(preset, FAST[1::2])
-        assert bench.description.source == Source('synthetic', start=1, max_frames=3, width=32)
-
-
-@pytest.mark.slow
-def test_bench_stops_at_a_preset_that_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert splatam('bench', tmp_path / 'nothing', '--presets', 'quick', '--out', tmp_path / 'b') == 2
-    assert 'preset quick ended with exit code 2' in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(('presets', 'message'), [('quick,quickest', "'quickest'"), ('quick,quick', 'different presets')])
-def test_bench_refuses_wrong_presets_before_it_begins(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], presets: str, message: str
-) -> None:
-    assert splatam('bench', *SOURCE, '--presets', presets, '--out', tmp_path / 'b') == 2
-    assert message in capsys.readouterr().err and not (tmp_path / 'b').exists()
 
 
 # --- render ---
@@ -279,6 +244,31 @@ def test_export_of_gaussians_is_the_map(run: RunRecord, tmp_path: Path) -> None:
         assert torch.allclose(getattr(exported, name), getattr(own, name), atol=1e-6)
 
 
+def test_export_pads_spherical_harmonics_and_reads_maps_of_other_programs(run: RunRecord, tmp_path: Path) -> None:
+    assert splatam('export', run.path, tmp_path / 'strict.ply', '--sh-degree', 3) == 0
+    assert b'property float f_rest_44\nproperty float opacity\n' in (tmp_path / 'strict.ply').read_bytes()
+    assert splatam('export', tmp_path / 'strict.ply', tmp_path / 'map.ply') == 0
+    assert (tmp_path / 'map.ply').stat().st_size == (run.path / 'map.ply').stat().st_size
+    assert splatam('export', tmp_path / 'strict.ply', tmp_path / 'points.ply', '--as', 'points', '--min-opacity', 0.1) == 0
+    assert splatam('export', tmp_path / 'strict.ply', tmp_path / 'map.splat') == 0
+    assert (tmp_path / 'map.splat').stat().st_size == 32 * len(run.read_map())
+
+
+def test_export_of_a_grid_needs_a_floor(run: RunRecord, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, message in (
+        (['--min-height', 2], '--min-height 2 is not below --max-height 1'),
+        (['--max-depth', 1], 'there is no grid: '),  # the room's floor is farther away
+    ):
+        assert splatam('export', run.path, tmp_path / 'm.yaml', '--as', 'grid', *arguments) == 2
+        assert message in capsys.readouterr().err
+    assert splatam('export', run.path, tmp_path / 'm.yaml', '--as', 'grid', '--every', 1) == 0
+    assert 'cells of 0.05 m' in capsys.readouterr().out and {path.name for path in tmp_path.iterdir()} == {'m.yaml', 'm.pgm'}
+    assert splatam('export', run.path, tmp_path / 'm.yaml', '--as', 'grid', '--overwrite') == 0
+    (tmp_path / 'm.yaml').unlink()
+    assert splatam('export', run.path, tmp_path / 'm.yaml', '--as', 'grid') == 2
+    assert 'm.pgm exists' in capsys.readouterr().err
+
+
 def test_export_of_points_is_the_opaque_centres(run: RunRecord, tmp_path: Path) -> None:
     own = run.read_map()
     middle = float(torch.sigmoid(own.logit_opacities).median())
@@ -355,9 +345,14 @@ def test_export_refuses_what_it_cannot_write(run: RunRecord, tmp_path: Path, cap
         ('map.obj', "'.obj' files are not written"),
         ('there.ply', 'or replace it with --overwrite'),
         ('no/map.ply', 'cannot be written'),
+        ('no/map.splat', 'cannot be written'),
     ):
         assert splatam('export', run.path, tmp_path / file) == 2
         assert message in capsys.readouterr().err
+    assert splatam('export', run.path, tmp_path / 'm.splat', '--sh-degree', 3) == 2
+    assert '--sh-degree is for .ply files' in capsys.readouterr().err
+    assert splatam('export', run.path / 'map.ply', tmp_path / 'm.npz', '--as', 'splatam') == 2
+    assert 'needs a run folder' in capsys.readouterr().err
     assert splatam('export', run.path, tmp_path / 'p.ply', '--as', 'points', '--min-opacity', 0.999) == 2
     assert 'is at least 0.999 opaque' in capsys.readouterr().err
     assert (tmp_path / 'there.ply').read_text() == 'mine'

@@ -19,6 +19,7 @@ import torch
 
 from splatam_core.config import load_config
 from splatam_core.errors import FrameError, RunFolderError
+from splatam_core.evaluation import lpips
 from splatam_core.evaluation.report.descriptions import DESCRIPTIONS
 from splatam_core.evaluation.report.frame_table import write_frame_table
 from splatam_core.evaluation.report.html import html_report
@@ -332,7 +333,8 @@ def test_page_of_hardly_a_run(tmp_path: Path, frames: int) -> None:
     assert f'of {frames}' in page.text
 
 
-def test_the_table_of_frames_is_what_the_means_are_of(tmp_path: Path) -> None:
+def test_the_table_of_frames_is_what_the_means_are_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(lpips.PATH_VARIABLE, str(tmp_path / 'none'))
     sequence = Wall()
     run = make_run(tmp_path, sequence)
     trajectory, images = score_trajectory(run, sequence.ground_truth()), score_images(run, sequence, 1, plain)
@@ -348,6 +350,18 @@ def test_the_table_of_frames_is_what_the_means_are_of(tmp_path: Path) -> None:
     errors = [float(row['position_error_m']) for row in frames]
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(evaluation.metrics.ate_rmse_m, abs=1e-8)
     assert {row['lpips'] for row in rows} == {''} and rows[-1]['position_error_m'] == ''
+
+
+def test_lpips_is_scored_where_its_weights_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sequence = Wall()
+    run = make_run(tmp_path / 'run', sequence)
+    monkeypatch.setenv(lpips.PATH_VARIABLE, str(tmp_path / 'weights.npz'))
+    missing = score_images(run, sequence, 1, plain)
+    assert missing.frames[0].scores.lpips is None and 'lpips-weights' in missing.notes['lpips']
+    lpips.save_weights({name: np.full(shape, 0.01, np.float32) for name, shape in lpips.SHAPES.items()})
+    scored = score_images(run, sequence, 1, plain)
+    assert 'lpips' not in scored.notes
+    assert all(0 <= score < 1e-3 for frame in scored.frames for score in (frame.scores.lpips, frame.original.lpips))
 
 
 def test_every_number_is_described_once() -> None:

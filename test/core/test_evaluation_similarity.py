@@ -1,16 +1,12 @@
-"""MS-SSIM by hand and against the library the original uses; LPIPS there, absent, and broken."""
+"""MS-SSIM by hand and against the library the original uses."""
 
 from __future__ import annotations
-
-import sys
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from splatam_core.evaluation.similarity import MIN_SIDE, Lpips, load_lpips, ms_ssim
+from splatam_core.evaluation.similarity import MIN_SIDE, ms_ssim
 
 
 def noisy_pair(height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -42,47 +38,3 @@ def test_as_the_library_that_the_original_uses(size: tuple[int, int]) -> None:
 
 def test_too_small_is_no_score() -> None:
     assert ms_ssim(*noisy_pair(MIN_SIDE - 1, 400)) is None
-
-
-@pytest.fixture
-def fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
-    """LPIPS is looked for anew, and what was found is forgotten afterwards."""
-    load_lpips.cache_clear()
-    monkeypatch.delitem(sys.modules, 'lpips', raising=False)
-    yield monkeypatch
-    load_lpips.cache_clear()
-
-
-def test_lpips_absent_names_what_to_install(fresh: pytest.MonkeyPatch) -> None:
-    fresh.setitem(sys.modules, 'lpips', None)
-    assert "pip install 'splatam_ros[lpips]'" in load_lpips()
-
-
-@pytest.mark.parametrize(
-    ('source', 'reason'),
-    [
-        (
-            "raise RuntimeError('operator torchvision::nms does not exist')",
-            'torchvision does not fit the installed torch',
-        ),
-        ("def LPIPS(**_): raise OSError('no network')", 'the weights of AlexNet cannot be loaded: no network'),
-    ],
-)
-def test_lpips_that_cannot_be_used_says_why(fresh: pytest.MonkeyPatch, tmp_path: Path, source: str, reason: str) -> None:
-    (tmp_path / 'lpips.py').write_text(source)
-    fresh.syspath_prepend(tmp_path)
-    assert reason in load_lpips()
-
-
-def test_lpips_gets_images_as_its_network_takes_them() -> None:
-    class Network:
-        def to(self, device: torch.device) -> Network:
-            return self
-
-        def __call__(self, a: Tensor, b: Tensor, normalize: bool) -> Tensor:
-            assert normalize and a.shape == b.shape == (1, 3, 40, 50)  # from [0, 1] to the [-1, 1] it was trained on
-            return (a - b).abs().mean().reshape(1, 1, 1, 1)
-
-    lpips = Lpips(Network())
-    assert lpips(torch.full((3, 40, 50), 0.5), torch.full((3, 40, 50), 0.2)) == pytest.approx(0.3)
-    assert lpips(torch.zeros(3, 30, 50), torch.zeros(3, 30, 50)) is None

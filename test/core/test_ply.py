@@ -81,6 +81,143 @@ def test_reads_maps_of_other_programs(tmp_path: Path) -> None:
     assert gaussians.log_scales.tolist() == [[-5.0]] * 3
 
 
+ENCODINGS = ['ascii', 'binary_little_endian', 'binary_big_endian']
+
+
+def encoded(path: Path, encoding: str, rows: np.ndarray, before: str = '', bytes_before: bytes = b'', newline: str = '\n') -> None:
+    """Write a structured array as the vertices of a PLY file."""
+    names = {'f4': 'float', 'f8': 'double', 'u1': 'uchar', 'i4': 'int'}
+    properties = [f'property {names[rows.dtype[name].str[1:]]} {name}' for name in rows.dtype.names]
+    head = ['ply', f'format {encoding} 1.0', 'comment of another program', *([before] if before else [])]
+    head += [
+        f'element vertex {len(rows)}',
+        *properties,
+        'element face 0',
+        'property list uchar int vertex_indices',
+        'end_header',
+        '',
+    ]
+    if encoding == 'ascii':
+        body = ''.join(' '.join(f'{value:.9g}' for value in row) + newline for row in rows.tolist()).encode()
+    else:
+        order = '<' if 'little' in encoding else '>'
+        body = rows.astype([(name, order + rows.dtype[name].str[1:]) for name in rows.dtype.names]).tobytes()
+    path.write_bytes(newline.join(head).encode() + bytes_before + body)
+
+
+def trained_map(count: int, names: list[str] | None = None) -> np.ndarray:
+    """Vertices as 3D Gaussian splatting writes them, with 45 coefficients of view-dependent colour."""
+    rest = [f'f_rest_{index}' for index in range(45)]
+    names = names or [*STANDARD[:9], *rest, *STANDARD[9:]]
+    rows, rng = np.zeros(count, dtype=[(name, '<f4') for name in names]), np.random.default_rng(1)
+    for name in names:
+        rows[name] = rng.standard_normal(count)
+    return rows
+
+
+@pytest.mark.parametrize('encoding', ENCODINGS)
+@pytest.mark.parametrize('newline', ['\n', '\r\n'])
+def test_every_encoding_is_read(tmp_path: Path, encoding: str, newline: str) -> None:
+    rows = trained_map(7)
+    encoded(tmp_path / 'map.ply', encoding, rows, newline=newline)
+    gaussians = read_ply(tmp_path / 'map.ply')
+    expected = {
+        'means': ('x', 'y', 'z'), 'log_scales': ('scale_0', 'scale_1', 'scale_2'), 'rotations': ('rot_0', 'rot_1', 'rot_2', 'rot_3')
+    }  # fmt: skip
+    for attribute, names in expected.items():
+        np.testing.assert_array_equal(getattr(gaussians, attribute), np.column_stack([rows[name] for name in names]))
+    colours = np.column_stack([rows[f'f_dc_{c}'] for c in range(3)]) * SH_C0 + 0.5
+    np.testing.assert_allclose(gaussians.rgb, colours, atol=1e-6)
+    np.testing.assert_array_equal(gaussians.logit_opacities, rows['opacity'])
+
+
+@pytest.mark.parametrize('encoding', ENCODINGS)
+def test_elements_before_the_gaussians_are_skipped(tmp_path: Path, encoding: str) -> None:
+    rows, before = trained_map(3), 'element camera 2\nproperty double focal\nproperty uchar kind'
+    skipped = b'5 1\n7 2\n' if encoding == 'ascii' else bytes(18)
+    encoded(tmp_path / 'map.ply', encoding, rows, before, skipped)
+    np.testing.assert_array_equal(read_ply(tmp_path / 'map.ply').means[:, 0], rows['x'])
+    encoded(tmp_path / 'list.ply', 'binary_big_endian', rows, 'element face 1\nproperty list uchar int corners', bytes(13))
+    with pytest.raises(MapFileError, match="element 'face' before 'vertex' has lists"):
+        read_ply(tmp_path / 'list.ply')
+
+
+@pytest.mark.parametrize('encoding', ENCODINGS)
+@pytest.mark.parametrize('scale', ['scale_0', 'scale_x', 'scale'])
+def test_one_scale_is_an_isotropic_map(tmp_path: Path, encoding: str, scale: str) -> None:
+    rows = trained_map(4, ['opacity', scale, 'z', 'y', 'x', 'f_dc_0', 'f_dc_1', 'f_dc_2'])
+    encoded(tmp_path / 'map.ply', encoding, rows)
+    gaussians = read_ply(tmp_path / 'map.ply')
+    np.testing.assert_array_equal(gaussians.log_scales[:, 0], rows[scale])
+    assert gaussians.rotations is None and gaussians.means.tolist() == np.column_stack([rows[name] for name in 'xyz']).tolist()
+
+
+def test_other_names_of_scales_and_rotations(tmp_path: Path) -> None:
+    rotation = ['rot_x', 'rot_y', 'rot_z', 'rot_w']  # as named, whatever their order in the file
+    rows = trained_map(5, [*rotation, 'x', 'y', 'z', 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', 'scale_x', 'scale_y', 'scale_z'])
+    encoded(tmp_path / 'map.ply', 'binary_little_endian', rows)
+    gaussians = read_ply(tmp_path / 'map.ply')
+    np.testing.assert_array_equal(gaussians.rotations, np.column_stack([rows[f'rot_{part}'] for part in 'wxyz']))
+    np.testing.assert_array_equal(gaussians.log_scales, np.column_stack([rows[f'scale_{axis}'] for axis in 'xyz']))
+
+
+def test_what_8_bits_cannot_say_is_limited(tmp_path: Path) -> None:
+    """An opacity of 255 / 255 has an infinite logit, and a size of zero an infinite logarithm; converters write both."""
+    rows = trained_map(4)
+    rows['opacity'][:3], rows['scale_1'][1] = [np.inf, -np.inf, 0.5], -np.inf
+    encoded(tmp_path / 'map.ply', 'ascii', rows)
+    gaussians = read_ply(tmp_path / 'map.ply')
+    assert gaussians.logit_opacities[:3].tolist() == [20, -20, 0.5] and gaussians.log_scales[1, 1] == -20
+    assert gaussians.usable().all()
+    for name, value in (('opacity', np.nan), ('scale_1', np.inf), ('x', np.inf)):
+        rows = trained_map(4)
+        rows[name][2] = value
+        encoded(tmp_path / 'map.ply', 'binary_big_endian', rows)
+        with pytest.raises(MapFileError, match='1 of 4 Gaussians contain NaN, infinity'):
+            read_ply(tmp_path / 'map.ply')
+
+
+def test_colours_may_be_bytes(tmp_path: Path) -> None:
+    names = ['x', 'y', 'z', 'red', 'green', 'blue', 'opacity', 'scale_0']
+    for kind in ('u1', '<f4'):
+        rows = np.zeros(2, dtype=[(name, kind if name in ('red', 'green', 'blue') else '<f4') for name in names])
+        rows['red'], rows['blue'] = [51, 255], 102
+        encoded(tmp_path / f'{kind}.ply', 'binary_little_endian', rows)
+    np.testing.assert_allclose(read_ply(tmp_path / 'u1.ply').rgb, [[0.2, 0, 0.4], [1, 0, 0.4]], atol=1e-7)
+    with pytest.raises(MapFileError, match='red, green, blue is float32: colours are read as f_dc_0 to f_dc_2, or as uchar'):
+        read_ply(tmp_path / '<f4.ply')
+
+
+def test_text_that_is_cut_short_or_ragged_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / 'map.ply'
+    encoded(path, 'ascii', trained_map(5))
+    *lines, last = path.read_bytes().splitlines(keepends=True)
+    for body, message in (([], 'only 4 follow'), ([b'1 2 3\n'], 'number of columns'), ([b'x' + last], 'could not convert')):
+        path.write_bytes(b''.join(lines + body))
+        with pytest.raises(MapFileError, match=message):
+            read_ply(path)
+    header = path.read_bytes().partition(b'end_header\n')[0]
+    path.write_bytes(header + b'end_header\n' + b'1 2 3\n' * 5)
+    with pytest.raises(MapFileError, match='the lines hold 3 numbers, but the header names 62 properties'):
+        read_ply(path)
+    path.write_bytes(header.replace(b'vertex 5', b'vertex 999999999999999999999') + b'end_header\n')
+    with pytest.raises(MapFileError, match='only 0 follow'):
+        read_ply(path)
+    path.write_bytes(header.replace(b'vertex 5', b'vertex 0') + b'end_header\n')
+    assert len(read_ply(path)) == 0
+
+
+@pytest.mark.parametrize(('degree', 'rest'), [(0, 0), (1, 9), (2, 24), (3, 45)])
+def test_higher_harmonics_are_zero_in_the_standard_order(tmp_path: Path, degree: int, rest: int) -> None:
+    written = some_gaussians(6)
+    write_ply(tmp_path / 'map.ply', written, sh_degree=degree)
+    header, body = split(tmp_path / 'map.ply')
+    names = [line.split()[2] for line in header if line.startswith('property float ')]
+    assert names == [*STANDARD[:9], *(f'f_rest_{index}' for index in range(rest)), *STANDARD[9:]]
+    rows = np.frombuffer(body, '<f4').reshape(6, -1)
+    assert not rows[:, 9 : 9 + rest].any() and torch.equal(read_ply(tmp_path / 'map.ply').means, written.means)
+
+
 @pytest.mark.parametrize('preset', ['realtime', 'splatam'])
 def test_maps_of_0_1_0_are_read_and_written_alike(tmp_path: Path, preset: str) -> None:
     written_by_0_1_0 = FIXTURES / preset / 'map.ply'
@@ -123,12 +260,19 @@ def test_anisotropic_maps_need_rotations(tmp_path: Path) -> None:
     ('old', 'new', 'message'),
     [
         (b'ply\n', b'PK\x03\x04', 'not a PLY file'),
-        (b'binary_little_endian', b'ascii', 'ascii 1.0.* is not supported: only format binary_little_endian 1.0 is read'),
-        (b'element vertex 5', b'element face 5', "first element must be 'vertex'"),
+        (b'binary_little_endian 1.0', b'binary_mixed_endian 1.0', "'format binary_mixed_endian 1.0' is not supported: expected"),
+        (b'binary_little_endian 1.0', b'binary_little_endian 2.0', 'is not supported: expected one of format ascii 1.0'),
+        (b'binary_little_endian', b'ascii', 'could not convert'),
+        (b'element vertex 5', b'element face 5', "no element 'vertex'"),
+        (b'element vertex 5', b'property float x', 'not a scalar property'),
         (b'element vertex 5', b'element vertex -5', "'-5' is not a number"),
         (b'element vertex 5', b'element vertex 6', 'cut short'),
         (b'element vertex 5', b'element vertex 999999999999999999', 'cut short'),
         (b'property float opacity\n', b'', 'property opacity is missing'),
+        (b'property float f_dc_1\n', b'', 'f_dc_1 is missing: a colour needs three'),
+        (b'property float scale_1\n', b'', 'flat Gaussians'),
+        (b'property float f_dc_0\n', b'', 'f_dc_0 is missing'),
+        (b'property float nx', b'property float packed_position', 'this map is compressed: unpack it first'),
         (b'property float nx', b'property list uchar int nx', 'not a scalar property'),
         (b'property float nx', b'property quad nx', 'not a scalar property'),
         (b'property float nx', b'property float x', 'more than once'),

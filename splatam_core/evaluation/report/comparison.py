@@ -1,9 +1,15 @@
-"""The comparison of several runs: a Markdown table, and a picture."""
+"""The comparison of several runs: tables, and a picture."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import io
+import json
+import os
+import statistics
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from urllib.parse import quote
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -11,8 +17,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
+from splatam_core.config import flat_values
 from splatam_core.evaluation.report.descriptions import BY_NAME, Description
+from splatam_core.evaluation.report.html import data_address
+from splatam_core.evaluation.report.tables import UNKNOWN, Table, page
 from splatam_core.evaluation.report.theme import LIGHT
+from splatam_core.runs.layout import PAGE
 from splatam_core.runs.metrics import Metrics
 from splatam_core.runs.record import RunRecord
 
@@ -37,8 +47,8 @@ class _Run:
     metrics: Metrics
 
 
-def comparison_table(runs: Sequence[RunRecord]) -> str:
-    """Return a Markdown table with one run per line, below a line with what the runs have in common."""
+def comparison_table(runs: Sequence[RunRecord]) -> Table:
+    """Return a table with one run per line. Columns that are empty for all runs are left out."""
     labelled = _labelled(runs)
     commits = {run.commit or 'unknown' for run in runs}
     sources = {_source(run) for run in runs}
@@ -46,17 +56,81 @@ def comparison_table(runs: Sequence[RunRecord]) -> str:
         ('run', [run.label for run in labelled]),
         *([('source', [_source(run) for run in runs])] if len(sources) > 1 else []),
         *([('commit', [(run.commit or 'unknown')[:10] for run in runs])] if len(commits) > 1 else []),
-        ('preset', [run.description.preset or 'none' for run in runs]),
+        ('preset', [_preset(run) for run in runs]),
         ('tracked', [f'{run.metrics.tracked}/{run.metrics.frames}' for run in labelled]),
     ]
     for name in COLUMNS:
         cells = [BY_NAME[name].text(run.metrics) for run in labelled]
-        if any(cell != '\u2013' for cell in cells):
+        if any(cell != UNKNOWN for cell in cells):
             columns.append((_heading(BY_NAME[name]), cells))
-    return '\n'.join([_in_common(runs, sources, commits), '', *_markdown(columns)])
+    return _table('Every run', columns)
 
 
-def _in_common(runs: Sequence[RunRecord], sources: set[str], commits: set[str]) -> str:
+def summary_table(runs: Sequence[RunRecord]) -> Table | None:
+    """Return a table with one line for all runs that differ in their seed only: median, smallest and largest value.
+
+    Returns:
+        None if no two runs have the same recording and settings.
+    """
+    groups: dict[tuple[str, str], list[_Run]] = {}
+    for run in _labelled(runs):
+        groups.setdefault((_source(run.record), _settings_but_seed(run.record)), []).append(run)
+    if all(len(group) == 1 for group in groups.values()):
+        return None
+    firsts = [group[0].record for group in groups.values()]
+    columns = [
+        ('preset', [_preset(record) for record in firsts]),
+        *([('source', [_source(record) for record in firsts])] if len({source for source, _ in groups}) > 1 else []),
+        ('runs', [str(len(group)) for group in groups.values()]),
+        ('tracked', ['/'.join(str(sum(values)) for values in _counts(group)) for group in groups.values()]),
+    ]
+    for name in COLUMNS:
+        cells = [_spread(BY_NAME[name], group) for group in groups.values()]
+        if any(cell != UNKNOWN for cell in cells):
+            columns.append((_heading(BY_NAME[name]), cells))
+    return _table('Median over seeds (smallest to largest)', columns)
+
+
+def _counts(runs: Sequence[_Run]) -> Iterator[tuple[int, ...]]:
+    return zip(*((run.metrics.tracked, run.metrics.frames) for run in runs))
+
+
+def _spread(description: Description, runs: Sequence[_Run]) -> str:
+    values = [value for run in runs if (value := run.metrics.values()[description.name]) is not None]
+    if not values:
+        return UNKNOWN
+    middle, low, high = (description.form_of(value) for value in (statistics.median(values), min(values), max(values)))
+    return middle if low == high else f'{middle} ({low} to {high})'
+
+
+def _settings_but_seed(run: RunRecord) -> str:
+    return json.dumps({name: value for name, value in flat_values(run.config).items() if name != 'seed'}, default=str)
+
+
+def _table(title: str, columns: Sequence[tuple[str, Sequence[str]]]) -> Table:
+    return Table(title, [heading for heading, _ in columns], list(zip(*(cells for _, cells in columns))))
+
+
+def comparison_page(runs: Sequence[RunRecord], beside: Path) -> str:
+    """Return tables and picture of the runs as a page.
+
+    Args:
+        runs: the runs.
+        beside: the page's folder; links lead from there to the runs' reports.
+    """
+    every = comparison_table(runs)
+    pages = {run.label: run.record.path / PAGE for run in _labelled(runs)}
+    links = {label: quote(os.path.relpath(path, beside)) for label, path in pages.items() if path.is_file()}
+    tables = [table for table in (summary_table(runs), replace(every, links=links)) if table is not None]
+    buffer = io.BytesIO()
+    draw_comparison(runs).savefig(buffer, format='png', dpi=120)
+    return page('Comparison', in_common(runs), tables, data_address('image/png', buffer.getvalue()))
+
+
+def in_common(runs: Sequence[RunRecord]) -> str:
+    """Return what the runs have in common: recording, commit and machine, as far as it is one."""
+    commits = {run.commit or 'unknown' for run in runs}
+    sources = {_source(run) for run in runs}
     machines = sorted({_machine(run) for run in runs})
     parts = [
         *(sources if len(sources) == 1 else []),
@@ -64,6 +138,10 @@ def _in_common(runs: Sequence[RunRecord], sources: set[str], commits: set[str]) 
         *machines,
     ]
     return '; '.join(parts)
+
+
+def _preset(run: RunRecord) -> str:
+    return run.description.preset or 'none'
 
 
 def _machine(run: RunRecord) -> str:
@@ -87,14 +165,6 @@ def _heading(description: Description) -> str:
     prefix = next((words for name, words in PREFIXES.items() if description.name.startswith(name)), '')
     label = prefix + description.label.removesuffix(' as the original')
     return f'{label} {description.unit}'.rstrip()
-
-
-def _markdown(columns: Sequence[tuple[str, list[str]]]) -> list[str]:
-    """Return the lines of a Markdown table, padded so that it is readable in a terminal."""
-    widths = [max(len(heading), *map(len, cells)) for heading, cells in columns]
-    rows = [[heading for heading, _ in columns], *zip(*(cells for _, cells in columns))]
-    lines = ['| ' + ' | '.join(cell.ljust(width) for cell, width in zip(row, widths)) + ' |' for row in rows]
-    return [lines[0], '|' + '|'.join('-' * (width + 2) for width in widths) + '|', *lines[1:]]
 
 
 def draw_comparison(runs: Sequence[RunRecord]) -> Figure:

@@ -33,7 +33,12 @@ class Description:
         value = metrics.values()[self.name]
         if value is None:
             return '\u2013'
-        return value if isinstance(value, str) else f'{value * self.factor:{self.form}}'
+        return value if isinstance(value, str) else self.form_of(value)
+
+    def form_of(self, value: float) -> str:
+        """Return a stored number as text without its unit; the mean of two counts is rounded."""
+        shown = value * self.factor
+        return f'{round(shown) if self.form.endswith("d") else shown:{self.form}}'
 
 
 def _image_scores(prefix: str, of: str) -> list[Description]:

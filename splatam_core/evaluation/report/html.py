@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import cv2
-import jinja2
 import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -22,6 +21,7 @@ from splatam_core.config import flat_values, settings
 from splatam_core.evaluation.report import plots
 from splatam_core.evaluation.report.descriptions import BY_NAME, DESCRIPTIONS
 from splatam_core.evaluation.report.picture import headline, number_text, subtitle
+from splatam_core.evaluation.report.tables import environment
 from splatam_core.evaluation.report.theme import DARK, LIGHT, Theme
 from splatam_core.evaluation.results import Evaluation, Sample
 from splatam_core.runs import provenance
@@ -87,7 +87,7 @@ def write_html(evaluation: Evaluation, path: Path) -> None:
 def html_report(evaluation: Evaluation) -> str:
     """Return the page as text."""
     metrics = evaluation.metrics
-    return _environment().get_template(TEMPLATE).render(
+    return environment().get_template(TEMPLATE).render(
         title=evaluation.run.path.resolve().name,
         subtitle=subtitle(evaluation),
         light=asdict(LIGHT),
@@ -104,16 +104,6 @@ def html_report(evaluation: Evaluation) -> str:
         settings=list(_settings(evaluation)),
         provenance=_provenance(evaluation),
     )  # fmt: skip
-
-
-def _environment() -> jinja2.Environment:
-    return jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
 
 
 # --- charts ---
@@ -145,7 +135,7 @@ def _svg(figure: Figure, theme: Theme) -> str:
     buffer = io.BytesIO()
     with matplotlib.rc_context({**theme.style(), 'svg.hashsalt': 'report'}):
         figure.savefig(buffer, format='svg', facecolor='none', metadata={'Date': None, 'Creator': None})
-    return _data_address('image/svg+xml', buffer.getvalue())
+    return data_address('image/svg+xml', buffer.getvalue())
 
 
 def _draw_paths(figure: Figure, evaluation: Evaluation, theme: Theme) -> None:
@@ -215,17 +205,18 @@ def _pictures(sample: Sample) -> Iterator[Picture]:
 
 def _jpeg(rgb: NDArray[np.uint8]) -> str:
     _, data = cv2.imencode('.jpg', np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return _data_address('image/jpeg', data.tobytes())
+    return data_address('image/jpeg', data.tobytes())
 
 
 def _png(values: NDArray[np.floating], colors: Colormap, norm: Normalize) -> str:
     """Colour an image [H, W]; NaN gets the colour map's colour for missing values."""
     rgb = np.asarray(colors(norm(np.ma.masked_invalid(values)), bytes=True))[..., :3]
     _, data = cv2.imencode('.png', np.ascontiguousarray(rgb[..., ::-1]))
-    return _data_address('image/png', data.tobytes())
+    return data_address('image/png', data.tobytes())
 
 
-def _data_address(kind: str, data: bytes) -> str:
+def data_address(kind: str, data: bytes) -> str:
+    """Return an address that contains what it leads to."""
     return f'data:{kind};base64,{base64.b64encode(data).decode("ascii")}'
 
 

@@ -1,0 +1,178 @@
+"""The floor plan of the synthetic room against its true one, its files by map_server's rules, and maps without a floor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import yaml
+from numpy.typing import NDArray
+
+from splatam_core.datasets.room import ROOM_SIZE_M, build_room, furniture
+from splatam_core.datasets.synthetic import CAMERA, SyntheticSequence, measured
+from splatam_core.errors import ExportError
+from splatam_core.geometry import se3
+from splatam_core.maps.grid import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    DepthView,
+    Grid,
+    GridSettings,
+    find_floor,
+    grid_of,
+    points_of,
+    rendered_views,
+    upright,
+    write_map_server,
+)  # fmt: skip
+from splatam_core.rasterizer import Gaussians, make_rasterizer
+
+WIDTH, VIEWS, STEP = 160, 30, 4  # a full turn
+CAM = CAMERA.resized(WIDTH, WIDTH * 3 // 4)
+SETTINGS = GridSettings()
+TOLERANCE_M = 0.02
+"""The error of measured depth at 3 m: a cell whose edge is this near to a surface may be either."""
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What a camera saw of the room.
+
+    Attributes:
+        views: noisy depth; the world is the first camera's.
+        T_room_world: [4, 4] that world in the room's axes.
+    """
+
+    views: list[DepthView]
+    T_room_world: NDArray[np.float64]
+
+
+@lru_cache(maxsize=2)
+def look_around(tilt_deg: float) -> Look:
+    """Turn around in the room with a camera that is tilted downwards."""
+    path = SyntheticSequence(motion='fast', width=WIDTH).ground_truth().T_world_cam[: VIEWS * STEP : STEP]
+    poses = path @ se3.exp(np.array([0, 0, 0, -np.radians(tilt_deg), 0, 0]))
+    room, views = build_room(0), []
+    for index, pose in enumerate(poses):
+        cast = room.cast(CAM, pose)
+        depth_m = measured(cast.depth_m, room.incidence(CAM, pose, cast), np.random.default_rng(index))
+        views.append(DepthView(np.where(np.isfinite(depth_m), depth_m, 0), se3.inverse(poses[0]) @ pose))
+    return Look(views, poses[0])
+
+
+def is_solid(points: NDArray[np.float64], low_m: float, high_m: float) -> NDArray[np.bool_]:
+    """Whether something stands or hangs at points [..., 2] of the floor, between two heights; outside there are walls."""
+    solid = (np.abs(points) >= np.array(ROOM_SIZE_M[:2]) / 2).any(axis=-1)
+    for box in furniture.boxes(np.random.default_rng([0, 1])):
+        if abs(box.center[2] - (low_m + high_m) / 2) < (box.size[2] + high_m - low_m) / 2:
+            local = (points - box.center[:2]) @ box.axes[:2, :2].T
+            solid |= (np.abs(local) <= box.size[:2] / 2).all(axis=-1)
+    for sphere in furniture.spheres():
+        squared = sphere.radius**2 - (sphere.center[2] - np.clip(sphere.center[2], low_m, high_m)) ** 2
+        solid |= ((points - sphere.center[:2]) ** 2).sum(axis=-1) <= squared
+    return solid
+
+
+def samples(grid: Grid, T_room_grid: NDArray[np.float64], margin_m: float) -> NDArray[np.float64]:
+    """Points [rows, columns, 49, 2] of the room's floor, all over each cell and up to a margin beyond its edges."""
+    inside = np.linspace(-margin_m, grid.resolution_m + margin_m, 7)
+    rows, columns = grid.cells.shape
+    x = grid.origin_m[0] + grid.resolution_m * np.arange(columns)[None, :, None, None] + inside[:, None]
+    y = grid.origin_m[1] + grid.resolution_m * np.arange(rows)[:, None, None, None] + inside
+    points = np.stack(np.broadcast_arrays(x, y), axis=-1).reshape(rows, columns, -1, 2)
+    return points @ T_room_grid[:2, :2].T + T_room_grid[:2, 3]
+
+
+def right_share(grid: Grid, T_room_grid: NDArray[np.float64]) -> float:
+    """The share of the known cells that are right."""
+    low_m, high_m = SETTINGS.min_height_m, SETTINGS.max_height_m
+    may_be_occupied = is_solid(samples(grid, T_room_grid, TOLERANCE_M), low_m - TOLERANCE_M, high_m + TOLERANCE_M).any(axis=-1)
+    within = samples(grid, T_room_grid, -TOLERANCE_M)
+    must_be_occupied = is_solid(within, low_m + TOLERANCE_M, high_m - TOLERANCE_M).any(axis=-1)
+    is_right = np.where(grid.cells == OCCUPIED, may_be_occupied, ~must_be_occupied)
+    return float(is_right[grid.cells != UNKNOWN].mean())
+
+
+def seen_known_share(grid: Grid, look: Look) -> float:
+    """Of the cells whose floor or obstacles two views saw, the share that is known."""
+    counts = np.zeros(grid.cells.shape, int)
+    for view in look.views:
+        world = points_of(view, CAM, SETTINGS.range_m)
+        points = world @ grid.T_grid_world[:3, :3].T + grid.T_grid_world[:3, 3]
+        column, row = (np.floor((points[:, axis] - grid.origin_m[axis]) / grid.resolution_m).astype(int) for axis in (0, 1))
+        low = (
+            (points[:, 2] < SETTINGS.max_height_m)
+            & (row >= 0)
+            & (row < counts.shape[0])
+            & (column >= 0)
+            & (column < counts.shape[1])
+        )
+        seen = np.zeros(counts.shape, bool)
+        seen[row[low], column[low]] = True
+        counts += seen
+    return float((grid.cells != UNKNOWN)[counts >= 2].mean())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('tilt_deg', [0, 20])
+def test_the_plan_is_that_of_the_room(tilt_deg: float) -> None:
+    look = look_around(tilt_deg)
+    T_grid_world = find_floor(look.views, CAM, SETTINGS.range_m)
+    T_room_grid = look.T_room_world @ se3.inverse(T_grid_world)
+    assert np.degrees(np.arccos(T_room_grid[2, 2])) < 0.5 and abs(T_room_grid[2, 3]) < 0.02  # up, and the floor's height
+    grid = grid_of(look.views, CAM, T_grid_world, SETTINGS)
+    assert right_share(grid, T_room_grid) >= 0.97
+    assert seen_known_share(grid, look) >= 0.9
+    inside = (grid.cells != UNKNOWN).sum() * grid.resolution_m**2
+    assert 10 < inside < ROOM_SIZE_M[0] * ROOM_SIZE_M[1] * 1.1  # square metres
+
+
+def test_the_axes_are_upright_and_point_where_the_first_camera_looks() -> None:
+    level = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # optical axes, 1.5 m over the floor
+    T_world_cam = np.eye(4)
+    T_grid_world = upright(np.array([0, -1.0, 0]), np.array([3.0, 1.5, 2.0]), T_world_cam)
+    np.testing.assert_allclose(T_grid_world, level, atol=1e-12)
+    down = se3.exp(np.array([0, 0, 0, -np.pi / 2, 0, 0]))  # looks straight down: the image's upward direction is forward
+    np.testing.assert_allclose(upright(np.array([0, -1.0, 0]), np.array([0, 1.5, 0]), down)[:3, :3], level[:3, :3], atol=1e-9)
+
+
+def test_a_map_without_a_floor_has_no_grid() -> None:
+    wall = DepthView(np.full((CAM.height, CAM.width), 2.0, np.float32), np.eye(4))
+    with pytest.raises(ExportError, match='no floor was seen, so it is not known where up is'):
+        find_floor([wall], CAM, 4.0)
+    nothing = DepthView(np.zeros((CAM.height, CAM.width), np.float32), np.eye(4))
+    for views in ([], [nothing]):
+        with pytest.raises(ExportError, match='the poses see too little of the map'):
+            find_floor(views, CAM, 4.0)
+    with pytest.raises(ExportError, match='nothing is within range'):
+        grid_of([nothing], CAM, np.eye(4), SETTINGS)
+    far = DepthView(nothing.depth_m, se3.exp(np.array([1e4, 1e4, 0, 0, 0, 0])))
+    with pytest.raises(ExportError, match='is too large: choose a larger --resolution'):
+        grid_of([nothing, far], CAM, np.eye(4), SETTINGS)
+
+
+def test_files_are_read_by_the_rules_of_map_server(tmp_path: Path) -> None:
+    """As nav2's map_io in mode trinary: the first row of the picture is the top, and shade s is p = (255 - s) / 255."""
+    cells = np.array([[OCCUPIED, FREE, UNKNOWN], [FREE, FREE, OCCUPIED]], np.int8)
+    write_map_server(tmp_path / 'map.yaml', Grid(cells, 0.05, (-1.25, 2.5), np.eye(4)))
+    meta = yaml.safe_load((tmp_path / 'map.yaml').read_text())
+    assert (meta['resolution'], meta['origin'], meta['mode'], meta['negate']) == (0.05, [-1.25, 2.5, 0.0], 'trinary', 0)
+    picture = cv2.imread(str(tmp_path / meta['image']), cv2.IMREAD_UNCHANGED)
+    p = (255 - picture[::-1].astype(float)) / 255
+    read = np.where(p > meta['occupied_thresh'], OCCUPIED, np.where(p < meta['free_thresh'], FREE, UNKNOWN))
+    assert read.tolist() == cells.tolist()
+    assert 'T_grid_world' in (tmp_path / 'map.yaml').read_text()
+
+
+def test_depth_is_rendered_from_the_map() -> None:
+    wall = torch.cartesian_prod(torch.linspace(-2, 2, 60), torch.linspace(-2, 2, 60), torch.tensor([2.0]))
+    count = len(wall)
+    gaussians = Gaussians(wall, torch.full((count, 1), -3.0), torch.full((count,), 4.0), torch.zeros(count, 3))
+    (view,) = rendered_views(gaussians, make_rasterizer('cpu', 1), CAM.resized(32, 24), np.eye(4)[None], list)
+    assert view.depth_m.shape == (24, 32) and np.abs(view.depth_m - 2).max() < 1e-3
