@@ -48,7 +48,7 @@ def _covered(frame: RgbdFrame, stamp_ns: int) -> RgbdFrame:
 
 
 def test_tracks_every_frame_of_the_room(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
-    """Within 1.5 cm and 0.6 degrees: at 96 pixels width one pixel is 0.7 degrees and 3 cm at the walls' 2.5 m; depth noise is 1 cm."""
+    """Within 1.5 cm and 0.6 degrees: at 96 pixels width a pixel is 0.7 degrees, 3 cm at the walls' 2.5 m; depth noise is 1 cm."""
     frames, truth = room
     slam = _slam()
     results = [slam.process(frame) for frame in frames]
