@@ -20,7 +20,7 @@ from splatam_core.rasterizer.base import BLUR_PX2
 MAX_BIAS = 0.1
 """As a fraction of the depth. A pixel that is off by more shows another surface."""
 
-BIAS_WINDOW = 5  # pixels
+BIAS_WINDOW = 5  # readings
 
 MIN_SQUARED_DEPTH = 0.01  # m^2: against division by zero
 
@@ -70,7 +70,8 @@ def depth_bias(render: Render, view: View) -> Tensor:
     """
     depth = render.depth()
     compared = (view.valid & (depth > 0) & ((depth - view.depth).abs() < MAX_BIAS * view.depth)).float()
-    error, weight = (box_sums(image, BIAS_WINDOW) for image in (compared * (depth - view.depth), compared))
+    side = 2 * round((BIAS_WINDOW * view.spacing - 1) / 2) + 1
+    error, weight = (box_sums(image, side) for image in (compared * (depth - view.depth), compared))
     return error / weight.clamp(min=1)
 
 

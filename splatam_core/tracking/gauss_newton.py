@@ -68,12 +68,14 @@ class _Pair:
     Attributes:
         reference: the render.
         layers: of the frame, see ``Aligner.layers``.
+        depth_share: of the frame, see ``Level``.
         predicted_motion: [4, 4] from the camera one frame ago to the render's; None if that is not known.
         time_offset: between colour and depth, before this frame.
     """
 
     reference: Level
     layers: Array | Tensor
+    depth_share: float
     predicted_motion: Matrix | None
     time_offset: TimeOffset
 
@@ -128,13 +130,14 @@ class GaussNewton:
         scales = _FIRST_SCALES
         for reference, frame in zip(reversed(references), reversed(frames), strict=True):
             layers = self._aligner.layers(frame.brightness, frame.depth, EDGE)
-            state, scales = self._iterate(_Pair(reference, layers, predicted_motion, time_offset), state, scales)
-        system = self._linearize(references[0], layers, state, scales)
+            pair = _Pair(reference, layers, frame.depth_share, predicted_motion, time_offset)
+            state, scales = self._iterate(pair, state, scales)
+        system = self._linearize(pair, state, scales)
         after = time_offset
         if self._estimates_time_offset:
             after = time_offset.updated(state.time_offset, self._time_offset_information(system))
         return self._better(
-            Alignment(start, self._linearize(references[0], layers, start, scales), time_offset),
+            Alignment(start, self._linearize(pair, start, scales), time_offset),
             Alignment(state, system, after),
         )
 
@@ -145,7 +148,7 @@ class GaussNewton:
         for _ in range(self._config.iterations):
             if pair.predicted_motion is not None:
                 state = replace(state, velocity=se3.log(state.depth_motion @ pair.predicted_motion))
-            system = self._linearize(pair.reference, pair.layers, state, scales)
+            system = self._linearize(pair, state, scales)
             scales = _scales(system)
             step = _step(system, state, self._free, pair.time_offset)
             if step is None:
@@ -155,18 +158,17 @@ class GaussNewton:
                 break
         return state, scales
 
-    def _linearize(
-        self, reference: Level, layers: Array | Tensor, state: AlignmentState, scales: tuple[float, float]
-    ) -> LinearSystem:
-        config = self._config
-        weights = config.color_weight, config.depth_weight
+    def _linearize(self, pair: _Pair, state: AlignmentState, scales: tuple[float, float]) -> LinearSystem:
+        config, reference = self._config, pair.reference
+        # What lies between readings repeats their errors, so that all of it counts as much as the readings alone.
+        weights = config.color_weight, config.depth_weight * pair.depth_share
         photometric_scale, depth_scale = (
             scale / math.sqrt(max(weight, _LEAST_WEIGHT)) for scale, weight in zip(scales, weights, strict=True)
         )
         return self._aligner.linearize(
             reference.brightness,
             reference.depth,
-            layers,
+            pair.layers,
             camera=reference.camera,
             color_motion=state.color_motion.astype(np.float32),
             depth_motion=state.depth_motion.astype(np.float32),

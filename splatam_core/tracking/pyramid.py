@@ -34,11 +34,13 @@ class Level:
         camera: its pinhole.
         brightness: [H, W] in [0, 1]; an array on the host, else a tensor.
         depth: [H, W] metres; NaN where there is none.
+        depth_share: fraction of the depths that are readings of their own; the others lie between readings.
     """
 
     camera: PinholeCamera
     brightness: Array | Tensor
     depth: Array | Tensor
+    depth_share: float = 1.0
 
 
 def frame_level(view: View, aligner: Aligner[Any]) -> Level:
@@ -47,13 +49,13 @@ def frame_level(view: View, aligner: Aligner[Any]) -> Level:
     Half of a stereo camera's readings may be missing, and depth that was registered by forward warping has a grid of holes.
     Halving drops every block with a hole, and colour is compared only at points of known depth.
     """
-    max_gap = max(1, round(_MAX_HOLE * view.camera.width))
+    max_gap, share = max(1, round(_MAX_HOLE * view.camera.width)), view.spacing**-2
     if not is_on_host(view.depth):
         readings = torch.where(view.valid, view.depth, torch.nan)
-        return Level(view.camera, brightness(view.rgb8), aligner.fill_holes(readings, max_gap, EDGE))
+        return Level(view.camera, brightness(view.rgb8), aligner.fill_holes(readings, max_gap, EDGE), share)
     depth = np.where(view.valid, view.depth, np.float32(np.nan))
     light = _brightness(view.rgb8.numpy().astype(np.float32) / np.float32(255))
-    return Level(view.camera, light, aligner.fill_holes(depth, max_gap, EDGE))
+    return Level(view.camera, light, aligner.fill_holes(depth, max_gap, EDGE), share)
 
 
 def render_level(render: Render, camera: PinholeCamera, silhouette_threshold: float) -> Level:
@@ -91,7 +93,7 @@ def _halved(level: Level, aligner: Aligner[Any]) -> Iterator[Level]:
     while min(level.camera.width, level.camera.height) >= 2 * _COARSEST_PX:
         width, height = level.camera.width // 2, level.camera.height // 2
         camera = level.camera.cropped(2 * width, 2 * height).resized(width, height)
-        level = Level(camera, *aligner.halve(level.brightness, level.depth, EDGE))
+        level = Level(camera, *aligner.halve(level.brightness, level.depth, EDGE), level.depth_share)
         yield level
 
 
