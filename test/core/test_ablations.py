@@ -12,7 +12,7 @@ import pytest
 from splatam_core.cli import main
 from splatam_core.config import flat_values
 from splatam_core.errors import RunFolderError
-from splatam_core.evaluation.ablations import FULL, provenance, table, variant_names, variants
+from splatam_core.evaluation.ablations import FULL, provenance, rows, variant_names, variants
 
 SMALL = ['synthetic', '--width', '48', '--max-frames', '3', '--set', 'threads=1', '--set', 'tracking.iterations=2',
          '--set', 'mapping.iterations=2']  # fmt: skip
@@ -50,7 +50,8 @@ def test_a_set_is_run_once_and_printed(tmp_path: Path, capfd: pytest.CaptureFixt
     monkeypatch.setattr('splatam_core.commands.shared.subprocess', SimpleNamespace(run=in_this_process))
     assert main(command) == 0
     first = capfd.readouterr()
-    assert 'runs: 1' in first.out and '| full | 3/3 |' in first.out and '| no_velocity | 3/3 |' in first.out
+    assert 'runs: 1' in first.out and all(f'| {name.ljust(11)} | 3/3     |' in first.out for name in ('full', 'no_velocity'))
+    assert '<td>no_velocity</td>' in (tmp_path / 'ablations.html').read_text()
     written = {path: path.stat().st_mtime_ns for path in tmp_path.rglob('*') if path.is_file()}
     (tmp_path / 'no_velocity' / 'metrics.json').unlink()  # as if it had been stopped
     assert main(command) == 0
@@ -78,9 +79,9 @@ def test_damaged_files_of_a_finished_run_are_one_line(tmp_path: Path, text: str 
         os.mkfifo(tmp_path / 'metrics.json')
     else:
         with pytest.raises(RunFolderError, match=r'metrics\.json:? cannot be read'):
-            table({'full': tmp_path})
+            rows({'full': tmp_path})
     with pytest.raises(RunFolderError, match='cannot be read') as caught:
         provenance([tmp_path])
     assert '\n' not in str(caught.value)
     if text is None:
-        assert '| full | – |' in table({'full': tmp_path})
+        assert rows({'full': tmp_path})[0][:2] == ('full', '–')
