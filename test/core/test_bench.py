@@ -130,7 +130,7 @@ from pathlib import Path
 name, out = sys.argv[1], Path(sys.argv[3])
 together = len(list(out.parent.glob('*.runs')))
 Path(f'{out}.runs').write_text('')
-print('name', name)
+print('name', name, flush=True)
 time.sleep(float(os.environ['JOB_S']))
 os.unlink(f'{out}.runs')
 out.mkdir()

@@ -31,7 +31,9 @@ def splatam(*words: object) -> int:
     return main([str(word) for word in words])
 
 
-PRESET_THEN: dict[str, dict[str, object]] = {'realtime': {'densification.depth_noise_ratio': 0.0}}
+PRESET_THEN: dict[str, dict[str, object]] = {
+    'realtime': {'densification.depth_noise_ratio': 0.0, 'tracking.silhouette_threshold': 0.99, 'mapping.max_gaussians': 0}
+}
 
 
 def config_of(name: str) -> SlamConfig:

@@ -157,7 +157,7 @@ def cut(path, length):
         ),
         (
             lambda folder: (folder / 'rgb/1.png').write_bytes((folder / 'rgb/2.png').read_bytes()[:60]),
-            r'rgb/1\.png: is not an image',
+            r'rgb/1\.png: is damaged, or cut off after 60 bytes',
         ),
         (lambda folder: cv2.imwrite(str(folder / 'depth/1.png'), np.zeros((48, 64, 3), np.uint8)), '16 bits'),
     ],

@@ -61,8 +61,9 @@ def _config(preset: str, *more: str) -> SlamConfig:
 
 
 # Of a pose from the same state, metres and radians: splatam sums float32 in another order; alignment, besides, decides by
-# single pixels (is a point that falls on the border inside?) how far its steps go, and stops short of convergence.
-TOLERANCE = {'splatam': 1e-4, 'realtime': 2e-4}
+# single pixels (is a point that falls on the border inside? is a seam of the map opaque enough?) how far its steps go, and
+# stops short of convergence. A pixel of these images is 7e-3.
+TOLERANCE = {'splatam': 1e-4, 'realtime': 5e-4}
 
 
 @pytest.mark.slow

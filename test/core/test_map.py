@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -16,7 +17,7 @@ from splatam_core.mapping.densification import densify, new_gaussians, unexplain
 from splatam_core.mapping.gaussian_map import PARAMETERS, GaussianMap
 from splatam_core.mapping.keyframes import KeyframeStore, draw, overlaps, select_keyframes, views_to_fit
 from splatam_core.mapping.loss import mapping_loss
-from splatam_core.mapping.optimizers import TimeLimit, make_optimizer, prunable
+from splatam_core.mapping.optimizers import TimeLimit, fused, make_optimizer, prunable
 from splatam_core.mapping.optimizers.fused import FINAL_FIRST, FINAL_LAST, FINAL_MEANS
 from splatam_core.mapping.posed import PosedView
 from splatam_core.mapping.schedule import MappingSchedule
@@ -225,12 +226,13 @@ def test_views_are_made_smaller_by_scale_and_width(scale: float, max_width: int,
     assert view.camera == _view().camera.resized(width, width * 3 // 4)
 
 
-def test_finishing_ends_when_its_time_is_up_and_nothing_is_asked_of_it_by_default() -> None:
+def test_finishing_ends_when_its_time_is_up_and_nothing_is_asked_of_it_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fused.time, 'monotonic', itertools.count(step=1e-3).__next__)  # a step takes a millisecond
     keyframe, rng = PosedView(_view(), EYE), np.random.default_rng(0)
     in_time = _Listed()
-    assert _finish([keyframe], in_time, _finishing(100_000), rng, TimeLimit(0.02)) < 100_000
+    assert _finish([keyframe], in_time, _finishing(100_000), rng, TimeLimit(0.0205)) == 20
     first, last = in_time.asked[0][0].rgb, in_time.asked[-1][0].rgb
-    assert last < 0.1 * first  # it faded, from 5 to about 0.2 of the usual: a step takes a small part of the time
+    assert last < 0.1 * first  # it faded, from 5 to about 0.2 of the usual
     assert _finish([keyframe], _Listed(), _finishing(5), rng, TimeLimit(0.0)) == 0
     stopped = _Listed()
     assert _finish([keyframe], stopped, _finishing(5), rng, TimeLimit(stop=lambda: len(stopped.asked) == 3)) == 3

@@ -152,7 +152,7 @@ def test_one_message_in_ten_is_lost(graph: Graph, frames: SyntheticSequence) -> 
 
 
 def test_corrupted_compressed_frames(graph: Graph, frames: SyntheticSequence) -> None:
-    """Bytes flipped or cut off: a warning or a wrong image, but never a crash; good frames are tracked."""
+    """Bytes flipped or cut off: a warning or a wrong image, but never a crash; every frame is answered, good ones are tracked."""
     rng = np.random.default_rng(2)
     live = Live(
         graph, camera_class=CompressedCamera, queue_policy='all', slam__tracking__min_inlier_fraction=0.5,
@@ -177,7 +177,7 @@ def test_corrupted_compressed_frames(graph: Graph, frames: SyntheticSequence) ->
     pose = live.show(still(frames, 41))
     assert pose is not None and np.linalg.norm(position(pose)) < STILL_M
     assert live.node.says('colour skipped', 'truncated or damaged') and 'Traceback' not in live.node.text
-    assert len(live.done) < 42  # damage was noticed
+    assert len(live.done) == 42
 
 
 def test_a_stamp_that_jumps_and_returns(graph: Graph, frames: SyntheticSequence) -> None:
