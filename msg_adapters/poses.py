@@ -64,6 +64,23 @@ def pose_stamped(factory: MessageFactory, T: Matrix, stamp_ns: int, frame_id: st
     )
 
 
+def pose_with_covariance(factory: MessageFactory, T: Matrix, covariance: Matrix, stamp_ns: int, frame_id: str) -> Any:
+    """Make a ``geometry_msgs/PoseWithCovarianceStamped`` of a [4, 4] pose in ``frame_id``.
+
+    Args:
+        factory: makes the message.
+        T: [4, 4] pose.
+        covariance: [6, 6] of x y z and the rotations about x y z, in the axes of ``frame_id``.
+        stamp_ns: stamp of the message.
+        frame_id: frame the pose is in.
+    """
+    return factory.make(
+        'geometry_msgs/msg/PoseWithCovarianceStamped',
+        header=stamps.header(factory, stamp_ns, frame_id),
+        pose=factory.make('geometry_msgs/msg/PoseWithCovariance', pose=pose_message(factory, T), covariance=np.ravel(covariance)),
+    )
+
+
 def odometry(
     factory: MessageFactory, T: Matrix, stamp_ns: int, frame_id: str, child_frame_id: str, *,
     pose_covariance: Matrix, twist: NDArray[np.float64], twist_covariance: Matrix,

@@ -118,6 +118,19 @@ class TrackingConfig:
         0.5, 'A frame is lost when less than this fraction of those pixels agrees with the map in depth and colour.',
         minimum=0.0, maximum=1.0,
     )  # fmt: skip
+    max_error_m: float = setting(
+        0.04,
+        'A frame is uncertain when three standard deviations of its position, or of its rotation in radians, exceed this; more is '
+        'allowed in images less than some 250 pixels wide (method align). Decrease when a robot must not rely on doubtful poses, '
+        'increase when too few frames are tracked.',
+        unit='m', minimum=1e-4, maximum=1e3,
+    )  # fmt: skip
+    min_explained_fraction: float = setting(
+        0.33,
+        'A frame is uncertain when brightness and depth fit in less than this fraction of the parts of the view that are mapped '
+        '(method align). Decrease when much of the view moves.',
+        minimum=0.0, maximum=1.0,
+    )  # fmt: skip
     inlier_depth: float = setting(0.1, 'Depth agrees when it differs by at most this fraction of the reading.', minimum=0.0)
     inlier_color: float = setting(
         0.2, 'Colour agrees when it differs by at most this, as a mean over the channels in [0, 1].', minimum=0.0

@@ -26,6 +26,7 @@ from splatam_core.state import SlamState
 from splatam_core.stopwatch import Stopwatch
 from splatam_core.tracking import Tracker, TrackingResult, make_tracker
 from splatam_core.tracking.motion import MotionModel, MotionPrior
+from splatam_core.tracking.verdict import Judge, Verdict
 from splatam_core.types import FrameResult, MapSnapshot, RenderedView, RgbdFrame, Status
 
 Matrix = NDArray[np.float64]
@@ -47,22 +48,24 @@ class CurrentFrame:
     clock: Stopwatch
 
     def result(
-        self, status: Status, T_world_cam: Matrix | None, slam: SlamLifecycle, *,
-        tracking: TrackingResult | None = None, is_keyframe: bool = False, reason: str = '',
+        self, verdict: Verdict, T_world_cam: Matrix | None, slam: SlamLifecycle, *,
+        tracking: TrackingResult | None = None, is_keyframe: bool = False,
     ) -> FrameResult:  # fmt: skip
         """Returns the result of this frame."""
-        is_first = status is Status.INITIALIZED
+        is_first = verdict.status is Status.INITIALIZED
         return FrameResult(
             index=self.index,
             stamp_ns=self.frame.stamp_ns,
-            status=status,
+            status=verdict.status,
             T_world_cam=T_world_cam,
             is_keyframe=is_keyframe,
             num_gaussians=slam.num_gaussians,
             visible_fraction=float(is_first) if tracking is None else tracking.visible_fraction,
             inlier_fraction=float(is_first) if tracking is None else tracking.inlier_fraction,
-            reason=reason,
+            reason=verdict.reason,
             timings=self.clock.timings(),
+            covariance=verdict.covariance,
+            num_held=verdict.num_held,
         )
 
 
@@ -106,6 +109,7 @@ class SlamLifecycle:
         """Forgets map, poses and camera; the next frame starts a new world."""
         self._mapper = self._new_mapper()
         self._motion = self._new_motion_model()
+        self._judge = Judge()
         self.camera: PinholeCamera | None = None
         self._num_frames = 0
         self._last_stamp_ns: int | None = None
@@ -167,6 +171,7 @@ class SlamLifecycle:
             map=self.map.arrays(),
             keyframes=tuple(self._mapper.keyframes),
             motion=self._motion.state(),
+            judge=self._judge.state,
             rng=dict(self._mapper.rng.bit_generator.state),
             scene_radius=self._mapper.scene_radius,
             num_frames=self._num_frames,
@@ -182,6 +187,7 @@ class SlamLifecycle:
         self.reset()
         self._mapper.restore(state.map, state.keyframes, state.rng, state.scene_radius)
         self._motion.restore(state.motion)
+        self._judge.state = state.judge
         self.camera = state.camera
         self._num_frames, self._last_stamp_ns = state.num_frames, state.last_stamp_ns
 

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from splatam_core.correction import correct
 from splatam_core.geometry import se3
 from splatam_core.images.observation import Observation
+from splatam_core.images.view import View
 from splatam_core.lifecycle import CurrentFrame, SlamLifecycle
 from splatam_core.mapping.posed import PosedFrame
-from splatam_core.tracking.verdict import verify
+from splatam_core.tracking import TrackingResult
+from splatam_core.tracking.motion import Prediction
+from splatam_core.tracking.verdict import Verdict
 from splatam_core.types import FrameResult, RgbdFrame, Status
 
 MIN_SIDE = 8  # pixels
@@ -28,19 +32,22 @@ class Slam(SlamLifecycle):
         if self.num_gaussians == 0:
             return self._initialize(current, seen)
 
-        predicted = se3.inverse(self._motion.predict(frame.stamp_ns))
-        last = se3.inverse(self._motion.last_pose)
-        view = seen.device.scaled(self.config.tracking.scale)
-        tracked = self._tracker.track(view, self.map.gaussians, predicted, last, self._motion.time_offset)
+        predictions = self._motion.predictions(frame.stamp_ns)
+        tracked, verdict = self._find(seen.device.scaled(self.config.tracking.scale), predictions)
         current.clock.lap('track')
-        if reason := verify(tracked, self.config.tracking):
+        if verdict.status is Status.LOST:
             self._motion.stop()
-            return current.result(Status.LOST, None, self, tracking=tracked, reason=reason)
+            return current.result(verdict, None, self, tracking=tracked)
 
         # Depth sets the pace: colour that comes late, or twice, says little about how the camera moves.
-        self._motion.observe(frame.stamp_ns, se3.inverse(tracked.T_cam_world_depth))
+        T_world_cam_depth, T_world_cam = se3.inverse(tracked.T_cam_world_depth), se3.inverse(tracked.T_cam_world)
+        self._motion.observe(frame.stamp_ns, T_world_cam_depth, is_trusted=verdict.status.is_trusted)
+        if not verdict.status.is_trusted:
+            return current.result(verdict, T_world_cam, self, tracking=tracked)
         self._motion.time_offset = tracked.time_offset
-        posed = PosedFrame(seen, tracked.T_cam_world, self.config.mapping)
+        if verdict.corrects:
+            correct(self._mapper, self._tracker, self.config.tracking, current.index)
+        posed = PosedFrame(seen, tracked.T_cam_world, self.config.mapping, current.index)
         plan = self._mapper.schedule.plan(current.index, tracked.visible_fraction)
         self._mapper.densify(posed, plan)
         current.clock.lap('densify')
@@ -48,8 +55,17 @@ class Slam(SlamLifecycle):
         current.clock.lap('keyframes')
         self._mapper.optimize(window, plan)
         current.clock.lap('map')
-        T_world_cam, is_keyframe = se3.inverse(tracked.T_cam_world), plan.is_keyframe
-        return current.result(Status.TRACKED, T_world_cam, self, tracking=tracked, is_keyframe=is_keyframe)
+        return current.result(verdict, T_world_cam, self, tracking=tracked, is_keyframe=plan.is_keyframe)
+
+    def _find(self, view: View, predictions: list[Prediction]) -> tuple[TrackingResult, Verdict]:
+        """Finds the pose of a view: from the last pose, and where that is uncertain, also from the last one to be trusted."""
+        found = [
+            self._tracker.track(
+                view, self.map.gaussians, predicted.T_cam_world, se3.inverse(predicted.T_world_cam_before), self._motion.time_offset
+            )
+            for predicted in predictions
+        ]
+        return self._judge.choose(found, predictions, self.config.tracking)
 
     def _initialize(self, current: CurrentFrame, seen: Observation) -> FrameResult:
         """Starts the map at the identity pose."""
@@ -63,7 +79,8 @@ class Slam(SlamLifecycle):
             reason = 'no pixel has a usable depth reading'
         if not reason:
             self._mapper = self._new_mapper()
-            posed, plan = PosedFrame(seen, np.eye(4), self.config.mapping), self._mapper.schedule.plan(0, visible_fraction=0.0)
+            posed = PosedFrame(seen, np.eye(4), self.config.mapping, current.index)
+            plan = self._mapper.schedule.plan(0, visible_fraction=0.0)
             self._mapper.densify(posed, plan)
             current.clock.lap('densify')
             self._mapper.optimize(self._mapper.select(posed, plan), plan)
@@ -71,6 +88,6 @@ class Slam(SlamLifecycle):
             if self.num_gaussians == 0:
                 reason = 'no reading lies where Gaussians would be added (densification.scale)'
         if reason:
-            return current.result(Status.LOST, None, self, reason=f'the map cannot start: {reason}')
+            return current.result(Verdict(Status.LOST, f'the map cannot start: {reason}'), None, self)
         self._motion.observe(current.frame.stamp_ns, np.eye(4))
-        return current.result(Status.INITIALIZED, np.eye(4), self, is_keyframe=True)
+        return current.result(self._judge.start(), np.eye(4), self, is_keyframe=True)

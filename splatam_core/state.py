@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from splatam_core.config import SlamConfig
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.mapping.posed import PosedView
 from splatam_core.tracking.motion import MotionState
+from splatam_core.tracking.verdict import JudgeState
 from splatam_core.types import Arrays
 
 
@@ -22,6 +23,7 @@ class SlamState:
         map: see ``GaussianMap.arrays``.
         keyframes: at the size they are fitted at, in the host's memory.
         motion: of the motion model.
+        judge: what the verdicts so far leave.
         rng: of numpy's generator, in the form of ``BitGenerator.state``.
         scene_radius: metres; 0 before the first frame.
         num_frames: number of frames processed.
@@ -37,3 +39,4 @@ class SlamState:
     scene_radius: float
     num_frames: int
     last_stamp_ns: int | None
+    judge: JudgeState = field(default_factory=JudgeState)

@@ -43,7 +43,13 @@ class Status(str, Enum):
 
     INITIALIZED = 'initialized'
     TRACKED = 'tracked'
+    UNCERTAIN = 'uncertain'
     LOST = 'lost'
+
+    @property
+    def is_trusted(self) -> bool:
+        """Whether the pose may be relied on and the frame be mapped."""
+        return self in (Status.INITIALIZED, Status.TRACKED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,20 +64,45 @@ class StageTimings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class PoseCovariance:
+    """How far a camera's pose may be off: relative to the map near it, and that of the map since the start.
+
+    The pose's error is that of x, y, z (m) and of the rotations about x, y, z (rad) through the camera's centre, in this
+    order, in the axes of the world (ROS REP 103).
+
+    Attributes:
+        relative: [6, 6] of the pose relative to the map that the frame sees.
+        drift_position_m: standard deviation, along each axis, of where the map itself is.
+        drift_rotation_rad: about each axis, of how it is turned.
+    """
+
+    relative: NDArray[np.float64]
+    drift_position_m: float
+    drift_rotation_rad: float
+
+    @property
+    def total(self) -> NDArray[np.float64]:
+        """[6, 6] of the pose relative to the first frame."""
+        return self.relative + np.diag(np.repeat([self.drift_position_m**2, self.drift_rotation_rad**2], 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class FrameResult:
     """What ``Slam.process`` returns for one frame.
 
     Attributes:
         index: number of the frame among those processed, from 0.
         stamp_ns: the frame's stamp.
-        status: initialized, tracked or lost.
+        status: initialized, tracked, uncertain or lost. Only initialized and tracked frames are mapped.
         T_world_cam: [4, 4] float64, camera to world; None if and only if the frame is lost.
         is_keyframe: True if the frame was kept as a keyframe for later mapping.
         num_gaussians: number of Gaussians in the map after this frame.
         visible_fraction: fraction of the pixels with a depth reading that see the map at the tracked pose.
         inlier_fraction: fraction of those that agree with the map in depth and colour.
-        reason: why the frame is lost; empty otherwise.
+        reason: why the frame is uncertain or lost; empty otherwise.
         timings: wall time of each stage.
+        covariance: of the pose; None if the frame is lost or the tracker estimates none.
+        num_held: number of directions (of six) that the images did not determine, in which the pose is the predicted one.
     """
 
     index: int
@@ -84,6 +115,8 @@ class FrameResult:
     inlier_fraction: float
     reason: str
     timings: StageTimings
+    covariance: PoseCovariance | None = None
+    num_held: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -55,7 +55,8 @@ INPUTS = (
 OUTPUTS = (
     Topic('~/processed', 'std_msgs/msg/Header', 'stamp of a frame for which nothing more is published',
           'with every frame, also lost ones'),
-    Topic('/tf', 'tf2_msgs/msg/TFMessage', 'see Frames', 'with every pose, if `publish_tf`'),
+    Topic('/tf', 'tf2_msgs/msg/TFMessage', 'see Frames',
+          'with every tracked frame, and map to odom with every frame, if `publish_tf`'),
     Topic('/tf_static', 'tf2_msgs/msg/TFMessage', 'base to camera, from `camera_in_base`; latched',
           'with the first pose, if `publish_tf` and no one else publishes it'),
     Topic('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', 'statuses input, tracking, processing and map',

@@ -54,6 +54,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ('splatam_core.tracking', 'splatam_core.mapping'),
     ('splatam_core.state',),
     ('splatam_core.lifecycle',),
+    ('splatam_core.correction',),
     ('splatam_core.slam',),
     ('splatam_core.worker', 'splatam_core.maps'),
     ('splatam_core.runs',),

@@ -169,7 +169,7 @@ def print_summary(metrics: Metrics, folder: Path, left_out: int = 0) -> None:
     """Prints the main numbers, one per line. left_out: number of frames that could not be used."""
     m, notes = metrics, metrics.notes
     rows = [
-        ('tracked', f'{m.tracked} of {m.frames} frames'),
+        ('tracked', f'{m.tracked} of {m.frames} frames{_not_tracked(m)}'),
         *([('left out', f'{left_out} of {m.frames + left_out} frames, which could not be used; see above')] if left_out else []),
         ('speed', _text(m.fps, 1, '.2f', 'fps, decoding excluded')),
         ('ATE RMSE', _text(m.ate_rmse_m, 100, '.2f', 'cm')),
@@ -192,6 +192,11 @@ def print_summary(metrics: Metrics, folder: Path, left_out: int = 0) -> None:
     rows += [('Gaussians', _text(m.num_gaussians, 1, ',', '')), ('results', str(folder))]
     for name, value in rows:
         print(f'{name:<10} {value}'.rstrip())
+
+
+def _not_tracked(metrics: Metrics) -> str:
+    counts = [f'{count} {name}' for name, count in (('uncertain', metrics.uncertain), ('lost', metrics.lost)) if count]
+    return f'; {", ".join(counts)}' if counts else ''
 
 
 def _relative(metrics: Metrics) -> str:

@@ -161,7 +161,7 @@ def _mesh(args: argparse.Namespace, run: RunRecord, gaussians: Gaussians) -> Sur
 
     rasterizer, device = rasterizer_for(run.config)
     return fused_mesh(
-        gaussians.to(device), rasterizer, run.camera_or_error(), run.trajectory.T_world_cam[:: args.every],
+        gaussians.to(device), rasterizer, run.camera_or_error(), run.tracked_trajectory().T_world_cam[:: args.every],
         voxel_m=args.voxel, max_depth_m=args.max_depth, progress=progress('fusing', 'view'),
     )  # fmt: skip
 
@@ -193,15 +193,15 @@ def _write_splatam(path: Path, run: RunRecord, gaussians: Gaussians) -> None:
     from splatam_core.types import Status
 
     poses = run.trajectory.T_world_cam
-    tracked = [frame for frame in run.frames if frame.status is not Status.LOST]
-    keyframes = [index for index, frame in enumerate(tracked) if frame.is_keyframe]
+    posed = [frame for frame in run.frames if frame.status is not Status.LOST]
+    keyframes = [index for index, frame in enumerate(posed) if frame.is_keyframe]
     arrays: dict[str, Any] = splatam_params(gaussians, run.camera_or_error(), poses, keyframes, _true_poses(run))
     with replaced(path) as temporary, temporary.open('wb') as file:
         np.savez(file, **arrays)
 
 
 def _true_poses(run: RunRecord) -> NDArray[np.float64]:
-    """Returns the ground-truth T_world_cam [T, 4, 4] of the tracked frames; NaN where it is unknown."""
+    """Returns the ground-truth T_world_cam [T, 4, 4] of the frames with a pose; NaN where it is unknown."""
     import numpy as np
 
     from splatam_core.geometry.trajectory import interpolate_poses

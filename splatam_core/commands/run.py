@@ -270,7 +270,7 @@ def _process(job: _Job, stop: _StopRequest) -> SplatamError | None:
     """Processes frame after frame, to the end or to a stop request. Returns the error that ended the recording, if any."""
     from tqdm import tqdm
 
-    tracked = lost = 0
+    counts = dict.fromkeys(('tracked', 'uncertain', 'lost'), 0)
     length = len(job.sequence)
     with tqdm(range(job.first, length), initial=job.first, total=length, unit='frame', dynamic_ncols=True) as bar:
         for index in bar:
@@ -288,8 +288,8 @@ def _process(job: _Job, stop: _StopRequest) -> SplatamError | None:
                 return error
             job.folder.append(frame, result, time.perf_counter() - decoded_s, decoded_s - started_s)
             job.checkpoints.after_frame(index, frame, job.slam)
-            tracked, lost = tracked + (result.T_world_cam is not None), lost + (result.T_world_cam is None)
-            bar.set_postfix(tracked=tracked, lost=lost, gaussians=result.num_gaussians, refresh=False)
+            counts['tracked' if result.status.is_trusted else result.status.value] += 1
+            bar.set_postfix(counts | {'gaussians': result.num_gaussians}, refresh=False)
     return None
 
 

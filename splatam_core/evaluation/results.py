@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core.evaluation.images import FrameScores, mean_original_scores, mean_scores
-from splatam_core.evaluation.trajectory import RelativePoseError, TrajectoryError
+from splatam_core.evaluation.trajectory import RelativePoseError, TrajectoryError, falsely_tracked
 from splatam_core.geometry.trajectory import Trajectory
 from splatam_core.runs.metrics import Metrics
 from splatam_core.runs.record import RunRecord
@@ -21,7 +21,8 @@ class TrajectoryEvaluation:
     """The trajectory against the ground truth.
 
     Attributes:
-        error: the absolute trajectory error of the tracked frames.
+        error: the absolute trajectory error of the frames with a pose.
+        tracked: that of the tracked frames alone; None where there are too few.
         per_frame: the relative pose error from frame to frame.
         per_second: the relative pose error over one second.
         splatam_ate_mean_m: the number that the original prints as "ATE RMSE".
@@ -29,6 +30,7 @@ class TrajectoryEvaluation:
     """
 
     error: TrajectoryError
+    tracked: TrajectoryError | None
     per_frame: RelativePoseError
     per_second: RelativePoseError
     splatam_ate_mean_m: float
@@ -123,7 +125,7 @@ def combine(
     """Fill the run's metrics with the given scores. Numbers of a part that is None keep their values."""
     metrics = run.metrics()
     if trajectory is not None:
-        metrics = _with_trajectory(metrics, trajectory)
+        metrics = _with_trajectory(metrics, trajectory, run)
     if images is not None:
         metrics = _with_images(metrics, images)
     if novel is not None:
@@ -131,11 +133,15 @@ def combine(
     return Evaluation(run, metrics, trajectory, images, novel)
 
 
-def _with_trajectory(metrics: Metrics, trajectory: TrajectoryEvaluation) -> Metrics:
+def _with_trajectory(metrics: Metrics, trajectory: TrajectoryEvaluation, run: RunRecord) -> Metrics:
+    tracked = trajectory.tracked
     return replace(
         metrics,
         ate_rmse_m=trajectory.error.rmse_m,
         ate_frames=len(trajectory.error.stamps_ns),
+        ate_tracked_rmse_m=None if tracked is None else tracked.rmse_m,
+        worst_error_m=None if tracked is None else float(tracked.errors_m.max()),
+        false_tracked=None if tracked is None else int(falsely_tracked(tracked, run.covariances()).sum()),
         splatam_ate_mean_m=trajectory.splatam_ate_mean_m,
         rpe_trans_frame_m=trajectory.per_frame.translation_rmse_m,
         rpe_rot_frame_deg=trajectory.per_frame.rotation_rmse_deg,

@@ -15,7 +15,9 @@ from splatam_core.evaluation.lpips import Lpips, load_lpips
 from splatam_core.evaluation.results import ImageEvaluation, NovelViews, Sample, TrajectoryEvaluation
 from splatam_core.evaluation.similarity import MIN_SIDE
 from splatam_core.evaluation.trajectory import (
+    TrajectoryError,
     align_poses,
+    has_enough_poses,
     relative_pose_errors,
     splatam_ate_mean_m,
     trajectory_error,
@@ -38,17 +40,24 @@ def score_trajectory(run: RunRecord, ground_truth: Trajectory) -> TrajectoryEval
         ground_truth: true poses in any world frame, at any stamps of the same clock.
 
     Raises:
-        RunFolderError: too few tracked frames have ground truth at their stamp.
+        RunFolderError: too few frames with a pose have ground truth at their stamp.
     """
     error = trajectory_error(run.trajectory, ground_truth)
     per_frame, per_second = relative_pose_errors(run.trajectory, ground_truth, run.lost_ns)
     return TrajectoryEvaluation(
         error=error,
+        tracked=_tracked_error(run, ground_truth),
         per_frame=per_frame,
         per_second=per_second,
         splatam_ate_mean_m=splatam_ate_mean_m(run.trajectory, ground_truth),
         ground_truth=transformed(ground_truth, error.T_estimate_ground_truth),
     )
+
+
+def _tracked_error(run: RunRecord, ground_truth: Trajectory) -> TrajectoryError | None:
+    """Returns the error of the tracked frames alone; None where there are too few for one."""
+    tracked = run.tracked_trajectory()
+    return trajectory_error(tracked, ground_truth) if has_enough_poses(tracked, ground_truth) else None
 
 
 def score_images(run: RunRecord, sequence: Sequence, every: int, progress: Progress) -> ImageEvaluation:
@@ -111,7 +120,7 @@ def score_novel_views(run: RunRecord, ground_truth: Trajectory, test: Sequence, 
         run: the run, made from the train split.
         ground_truth: the true poses of the train split.
         test: the test split; its true poses are in the same world.
-        alignment: what aligns the ground truth to the map's world: ``trajectory``, all tracked poses that have ground
+        alignment: what aligns the ground truth to the map's world: ``trajectory``, all poses that have ground
             truth (their mean rotation, then their mean translation); or ``first``, only the first of them, as in the
             original.
         progress: wraps the loop over the test split, to display progress.
@@ -150,7 +159,7 @@ def score_novel_views(run: RunRecord, ground_truth: Trajectory, test: Sequence, 
 def _T_map_ground_truth(run: RunRecord, ground_truth: Trajectory, alignment: str) -> Pose:
     poses, known = interpolate_poses(ground_truth, run.trajectory.stamps_ns)
     if not known.any():
-        raise RunFolderError(f'none of the {len(run.trajectory)} tracked frames has ground truth at its stamp')
+        raise RunFolderError(f'none of the {len(run.trajectory)} frames with a pose has ground truth at its stamp')
     count = None if alignment == 'trajectory' else 1
     return align_poses(poses[known][:count], run.trajectory.T_world_cam[known][:count])
 
@@ -215,7 +224,7 @@ def _sample(title: str, scorer: ViewScorer, frame: RgbdFrame, T_world_cam: Pose,
 
 def _no_common_frame(run: RunRecord, sequence: Sequence) -> str:
     return (
-        f'none of the {len(run.trajectory)} tracked frames is in {sequence.name}: the run starts at '
+        f'none of the {len(run.trajectory)} frames with a pose is in {sequence.name}: the run starts at '
         f'{stamp_text(int(run.trajectory.stamps_ns[0]))} s, the recording at {stamp_text(sequence[0].stamp_ns)} s; '
         'is it the recording that the run was made from?'
     )

@@ -8,7 +8,7 @@ SplaTAM's own evaluation prints as ATE.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,7 @@ from splatam_core.geometry.trajectory import (
     interpolate_poses,
     stamp_text,
 )
+from splatam_core.types import PoseCovariance
 
 Indices = NDArray[np.intp]
 
@@ -29,6 +30,8 @@ ONE_SECOND_NS = 1_000_000_000
 
 INTERVAL_TOLERANCE_NS = 20_000_000
 """Tolerance of the interval between two frames one second apart. At 30 Hz the nearest frame is within 17 ms."""
+
+FALSE_M, FALSE_DEVIATIONS = 0.1, 3.0
 
 MIN_POSES = 3
 """Fewer poses can always be aligned without error, so their ATE has no meaning."""
@@ -59,7 +62,7 @@ def trajectory_error(estimate: Trajectory, ground_truth: Trajectory) -> Trajecto
     """Compute the absolute trajectory error.
 
     Args:
-        estimate: online poses of the tracked frames, camera to world.
+        estimate: online poses, camera to world.
         ground_truth: true poses in any world frame, at any stamps of the same clock.
 
     Raises:
@@ -80,6 +83,28 @@ def trajectory_error(estimate: Trajectory, ground_truth: Trajectory) -> Trajecto
         errors_m=errors_m,
         T_estimate_ground_truth=T,
     )
+
+
+def has_enough_poses(estimate: Trajectory, ground_truth: Trajectory) -> bool:
+    """Returns whether enough frames have ground truth for a trajectory error."""
+    _, known = interpolate_centres(ground_truth, estimate.stamps_ns)
+    return int(known.sum()) >= MIN_POSES
+
+
+def falsely_tracked(error: TrajectoryError, covariances: Mapping[int, PoseCovariance]) -> NDArray[np.bool_]:
+    """Returns [N] which tracked frames are farther from the ground truth than 10 cm and than three standard deviations.
+
+    Args:
+        error: of the tracked frames, and of no others.
+        covariances: of their poses, by stamp; a frame without one may be 10 cm off.
+    """
+    limits_m = [
+        max(FALSE_M, FALSE_DEVIATIONS * float(np.sqrt(np.trace(covariances[stamp_ns].total[:3, :3]))))
+        if stamp_ns in covariances
+        else FALSE_M
+        for stamp_ns in map(int, error.stamps_ns)
+    ]
+    return error.errors_m > np.array(limits_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,11 +128,11 @@ def relative_pose_errors(
     """Compute the relative pose error from each frame to the next, and over one second.
 
     Sturm et al., equation 2: ``(Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`` with true poses Q and estimated poses P, without alignment.
-    For the first error, frame j is the next tracked frame; pairs with a lost frame between them are skipped. For the
+    For the first error, frame j is the next frame with a pose; pairs with a lost frame between them are skipped. For the
     second, frame j is the frame nearest to one second later; pairs more than 20 ms off are skipped.
 
     Args:
-        estimate: online poses of the tracked frames.
+        estimate: online poses.
         ground_truth: true poses, in any world frame.
         lost_ns: stamps of the lost frames.
 
@@ -229,7 +254,7 @@ def transformed(trajectory: Trajectory, T_new_old: NDArray[np.float64]) -> Traje
 
 def _too_few(estimate: Trajectory, ground_truth: Trajectory, found: int) -> str:
     return (
-        f'{found} of {len(estimate)} tracked frames have ground truth at their stamp, at least {MIN_POSES} are needed: '
+        f'{found} of {len(estimate)} frames with a pose have ground truth at their stamp, at least {MIN_POSES} are needed: '
         f'the frames span {_span(estimate)}, the ground truth {_span(ground_truth)}; '
         'are they of the same recording and clock?'
     )

@@ -22,6 +22,7 @@ _log = logging.getLogger(__name__)
 
 PARAMETERS = ('means', 'log_scales', 'logit_opacities', 'rgb')
 ROTATIONS = 'rotations'  # one more parameter of anisotropic maps
+ADDED_BY = 'added_by'
 BOUNDS = 'bounds'
 
 
@@ -38,6 +39,7 @@ class GaussianMap:
         rgb: [N, 3], nominally in [0, 1].
         rotations: [N, 4] see ``Gaussians``; None when isotropic.
         num_refused: number of Gaussians that were not added or were dropped because a value was not finite.
+        frame: number of the frame that Gaussians are added by from now on.
     """
 
     means: Tensor
@@ -47,12 +49,13 @@ class GaussianMap:
     rotations: Tensor | None
 
     def __init__(self, anisotropic: bool = False, device: torch.device = HOST) -> None:
-        self._size = self.num_refused = 0
+        self._size = self.num_refused = self.frame = 0
         self._names = (*PARAMETERS, ROTATIONS) if anisotropic else PARAMETERS
         self._storage = {
             'means': torch.empty(0, 3), 'log_scales': torch.empty(0, 3 if anisotropic else 1),
             'logit_opacities': torch.empty(0), 'rgb': torch.empty(0, 3),
             'first_second': torch.empty(0, 16), 'steps': torch.empty(0, dtype=torch.uint8),
+            ADDED_BY: torch.empty(0, dtype=torch.int32),
         }  # fmt: skip
         if anisotropic:
             self._storage[ROTATIONS] = torch.empty(0, 4)
@@ -81,6 +84,11 @@ class GaussianMap:
         """Adam moments of the fused optimizer (``Rasterizer.fit``); they live as long as their Gaussians."""
         return Moments(self._storage['first_second'][: self._size], self._storage['steps'][: self._size])
 
+    @property
+    def added_by(self) -> Tensor:
+        """[N] number of the frame that added each Gaussian; 0 for those of a map that was loaded."""
+        return self._storage[ADDED_BY][: self._size]
+
     def append(self, new: Gaussians) -> Tensor:
         """Adds Gaussians, but none that is not ``usable``. Ends an optimization in progress.
 
@@ -100,6 +108,7 @@ class GaussianMap:
         self._reserve()
         for name in ('first_second', 'steps'):
             self._storage[name][old_size : self._size] = 0
+        self._storage[ADDED_BY][old_size : self._size] = self.frame
         self._refresh_views()
         self._put(new, old_size)
         return added
@@ -224,6 +233,7 @@ class GaussianMap:
             ValueError: the arrays do not fit this kind of map.
         """
         size = len(arrays['means']) if 'means' in arrays else 0
+        arrays = {ADDED_BY: np.zeros(size, np.int32), **arrays}  # 0.1.0 did not record it
         capacity = {name: values.new_empty(size, *values.shape[1:]) for name, values in self._storage.items()}
         bounds = self._bounds.new_empty(-(-size // BLOCK), *self._bounds.shape[1:])
         expected = capacity | {BOUNDS: bounds}

@@ -52,6 +52,12 @@ class KeyframeStore(Sequence[PosedView]):
         if copy is not None and copy.view.depth.device != keyframe.view.depth.device:
             self._remember(keyframe, copy)
 
+    def drop_from(self, frame: int) -> None:
+        """Drops the keyframes of the frames from a number on."""
+        for keyframe in [keyframe for keyframe in self._kept if keyframe.frame >= frame]:
+            self._kept.remove(keyframe)
+            self._copies.pop(keyframe, None)
+
     def on_device(self, keyframe: PosedView) -> PosedView:
         """Returns a keyframe on the device; copies it there if necessary."""
         if keyframe.view.depth.device == self._device:

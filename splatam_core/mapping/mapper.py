@@ -74,6 +74,7 @@ class Mapper:
             return
         self._measure_scene(frame.observation.host)
         if plan.densifies:
+            self.map.frame = frame.index
             densify(self.map, frame.device.view, frame.device.T_cam_world, self._rasterizer, self._config.densification)
             self._limit_size(frame.device.T_cam_world)
 
@@ -111,6 +112,18 @@ class Mapper:
             return
         views = views_to_fit(window, plan.steps, self._config, self.rng)
         self._optimizer.fit(self.map, takewhile(lambda _: not self._stop(), views), self.scene_radius)
+
+    def retract(self, first: int) -> int:
+        """Removes what the frames from a number on have added: Gaussians and keyframes. Returns the number of Gaussians.
+
+        What those frames have moved stays where it is; the steps that follow, on other views, move it back.
+        """
+        added_before = self.map.added_by < first
+        self.keyframes.drop_from(first)
+        removed = len(added_before) - int(added_before.sum())
+        if removed:
+            self.map.keep(added_before)
+        return removed
 
     def finish(self, limit: TimeLimit) -> int:
         """Fits the map to all keyframes once more, after the last frame. Returns the number of steps."""

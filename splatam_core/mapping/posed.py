@@ -23,29 +23,31 @@ class PosedView:
     Attributes:
         view: the images.
         T_cam_world: [4, 4] float32.
+        frame: number of the frame that it is of; -1 where that is not known.
     """
 
     view: View
     T_cam_world: Tensor
+    frame: int = -1
 
     @classmethod
-    def at(cls, view: View, T_cam_world: NDArray[np.float64]) -> PosedView:
+    def at(cls, view: View, T_cam_world: NDArray[np.float64], frame: int = -1) -> PosedView:
         """Returns a view at a pose [4, 4] float64, on the view's device."""
-        return cls(view, pose_tensor(T_cam_world, view.depth.device))
+        return cls(view, pose_tensor(T_cam_world, view.depth.device), frame)
 
     def to(self, device: torch.device) -> PosedView:
         """Returns the same on a device; itself where it is there already."""
         if self.view.depth.device == device:
             return self
-        return PosedView(self.view.to(device), self.T_cam_world.to(device, non_blocking=True))
+        return PosedView(self.view.to(device), self.T_cam_world.to(device, non_blocking=True), self.frame)
 
     def half_size(self) -> PosedView:
         """Returns the same at half the size."""
-        return PosedView(self.view.scaled(0.5), self.T_cam_world)
+        return PosedView(self.view.scaled(0.5), self.T_cam_world, self.frame)
 
     def bare(self) -> PosedView:
         """Returns the same without cached images: seven bytes a pixel."""
-        return PosedView(replace(self.view), self.T_cam_world)
+        return PosedView(replace(self.view), self.T_cam_world, self.frame)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,26 +58,29 @@ class PosedFrame:
         observation: the images.
         T_cam_world: [4, 4] float64.
         config: says at which size views are fitted.
+        index: number of the frame.
     """
 
     observation: Observation
     T_cam_world: NDArray[np.float64]
     config: MappingConfig
+    index: int = -1
 
     @cached_property
     def host(self) -> PosedView:
         """Full size, in the host's memory: the overlap with keyframes is measured on it."""
-        return PosedView.at(self.observation.host, self.T_cam_world)
+        return PosedView.at(self.observation.host, self.T_cam_world, self.index)
 
     @cached_property
     def device(self) -> PosedView:
         """Full size, on the device: Gaussians are added from it."""
-        return PosedView.at(self.observation.device, self.T_cam_world)
+        return PosedView.at(self.observation.device, self.T_cam_world, self.index)
 
     @cached_property
     def keyframe(self) -> PosedView:
         """At the size at which views are fitted, in the host's memory: what is kept."""
-        return PosedView.at(self.observation.host.narrowed(self.config.scale, self.config.max_width), self.T_cam_world)
+        view = self.observation.host.narrowed(self.config.scale, self.config.max_width)
+        return PosedView.at(view, self.T_cam_world, self.index)
 
     @cached_property
     def to_fit(self) -> PosedView:

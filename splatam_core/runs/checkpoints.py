@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +34,14 @@ from splatam_core.runs.layout import KEYFRAMES
 from splatam_core.state import SlamState
 from splatam_core.tracking.motion import MotionState
 from splatam_core.tracking.time_offset import TimeOffset
+from splatam_core.tracking.verdict import JudgeState
 from splatam_core.types import Arrays
 
 VERSION = 1
 KIND, KEYFRAME = 'checkpoint', 'keyframe'
 _MAP = 'map.'
+_JUDGE = tuple(entry.name for entry in fields(JudgeState) if entry.name != 'covariance')
+_MOTION_SHAPES = {'T_world_cam': (4, 4), 'velocity': (6,), 'T_world_cam_trusted': (4, 4), 'pose_covariance': (6, 6)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +113,7 @@ class Checkpoints:
             'rgb8': keyframe.view.rgb8.numpy(force=True), 'depth': keyframe.view.depth.numpy(force=True),
             'T_cam_world': keyframe.T_cam_world.numpy(force=True),
         }  # fmt: skip
-        file = pack(KEYFRAME, VERSION, Content({'spacing': keyframe.view.spacing}, arrays))
+        file = pack(KEYFRAME, VERSION, Content({'frame': keyframe.frame, 'spacing': keyframe.view.spacing}, arrays))
         file.write(_keyframe_path(self._folder, file.digest))
         return file.digest
 
@@ -182,9 +185,12 @@ def _to_content(state: SlamState, progress: Progress, digests: Sequence[str]) ->
         'keyframes': list(digests), 'rng': state.rng, 'scene_radius': state.scene_radius, 'num_frames': state.num_frames,
         'last_stamp_ns': state.last_stamp_ns, 'progress': asdict(progress),
         'motion_ns': [motion.stamp_ns, motion.interval_ns], 'time_offset': asdict(motion.time_offset),
+        'trusted_ns': motion.trusted_ns, 'judge': {name: getattr(state.judge, name) for name in _JUDGE},
     }  # fmt: skip
     arrays = {_MAP + name: array for name, array in state.map.items()}
-    return Content(values, arrays | {'T_world_cam': motion.T_world_cam, 'velocity': motion.velocity})
+    arrays |= {'T_world_cam': motion.T_world_cam, 'velocity': motion.velocity}
+    arrays |= {'T_world_cam_trusted': motion.T_world_cam_trusted, 'pose_covariance': state.judge.covariance}
+    return Content(values, arrays)
 
 
 def _from_content(path: Path, content: Content) -> Checkpoint:
@@ -192,17 +198,25 @@ def _from_content(path: Path, content: Content) -> Checkpoint:
     _check_values(values, arrays)
     camera = None if values['camera'] is None else PinholeCamera(**values['camera'])
     stamp_ns, interval_ns = values['motion_ns']
-    time_offset = TimeOffset(**values.get('time_offset', {}))  # 0.1.0 estimated it in every frame anew
     state = SlamState(
         config=with_values(SlamConfig(), migrated(values['config'])),
         camera=camera,
         map={name.removeprefix(_MAP): array for name, array in arrays.items() if name.startswith(_MAP)},
         keyframes=tuple(_read_keyframe(path.parent, digest, camera) for digest in values['keyframes']),
-        motion=MotionState(stamp_ns, interval_ns, arrays['T_world_cam'], arrays['velocity'], time_offset),
+        motion=MotionState(
+            stamp_ns=stamp_ns,
+            interval_ns=interval_ns,
+            T_world_cam=arrays['T_world_cam'],
+            velocity=arrays['velocity'],
+            time_offset=TimeOffset(**values.get('time_offset', {})),  # 0.1.0 estimated it in every frame anew
+            trusted_ns=values.get('trusted_ns'),
+            T_world_cam_trusted=arrays.get('T_world_cam_trusted', np.eye(4)),
+        ),
         rng=values['rng'],
         scene_radius=values['scene_radius'],
         num_frames=values['num_frames'],
         last_stamp_ns=values['last_stamp_ns'],
+        judge=JudgeState() if 'judge' not in values else JudgeState(**values['judge'], covariance=arrays['pose_covariance']),
     )
     return Checkpoint(path, state, Progress(**values['progress']))
 
@@ -217,8 +231,7 @@ def _check_values(values: Mapping[str, Any], arrays: Arrays) -> None:
     progress, (stamp_ns, interval_ns) = values['progress'], values['motion_ns']
     whole = {'num_frames': values['num_frames'], 'motion_ns': stamp_ns, 'interval_ns': interval_ns}
     whole |= {name: progress[name] for name in ('length', 'last_index', 'num_lines')}
-    if values['last_stamp_ns'] is not None:
-        whole['last_stamp_ns'] = values['last_stamp_ns']
+    whole |= {name: values[name] for name in ('last_stamp_ns', 'trusted_ns') if values.get(name) is not None}
     if wrong := [name for name, number in whole.items() if type(number) is not int or abs(number) >= 2**63]:
         raise ValueError(f'{wrong[0]} = {whole[wrong[0]]!r}: expected a whole number')
     if not 0 <= progress['last_index'] < progress['length'] or progress['num_lines'] < 0:
@@ -226,12 +239,16 @@ def _check_values(values: Mapping[str, Any], arrays: Arrays) -> None:
     radius = values['scene_radius']
     if type(radius) not in (int, float) or not 0 <= radius < math.inf:
         raise ValueError(f'scene_radius = {radius!r}: expected a length')
-    offset = values.get('time_offset', {}).values()
-    if not all(type(number) in (int, float) and math.isfinite(number) for number in offset):
-        raise ValueError(f'time_offset = {values["time_offset"]!r}: expected numbers')
-    for name in ('T_world_cam', 'velocity'):
-        if arrays[name].dtype != np.float64 or not np.isfinite(arrays[name]).all():
-            raise ValueError(f'{name} holds numbers that are not finite')
+    for name in ('time_offset', 'judge'):  # neither was in 0.1.0
+        if not all(type(number) in (int, float, bool) and math.isfinite(number) for number in values.get(name, {}).values()):
+            raise ValueError(f'{name} = {values[name]!r}: expected numbers')
+    for name, shape in _MOTION_SHAPES.items():
+        array = arrays.get(name)
+        is_known_later = name in ('T_world_cam_trusted', 'pose_covariance') and 'judge' not in values
+        if array is None and is_known_later:
+            continue
+        if array is None or array.dtype != np.float64 or array.shape != shape or not np.isfinite(array).all():
+            raise ValueError(f'{name}: expected {shape} finite numbers')
 
 
 def _read_keyframe(folder: Path, digest: str, camera: PinholeCamera | None) -> PosedView:
@@ -240,6 +257,7 @@ def _read_keyframe(folder: Path, digest: str, camera: PinholeCamera | None) -> P
         raise CheckpointError(f'{path}: is no keyframe of this run, which has no camera')
     content = read_archive(path, KEYFRAME, VERSION, digest)
     arrays, spacing = content.arrays, content.values.get('spacing', 1.0)  # dense before 0.3
+    frame = content.values.get('frame', -1)  # 0.1.0 did not record it
     rgb8, depth, T_cam_world = (arrays[name] for name in ('rgb8', 'depth', 'T_cam_world'))
     if depth.ndim == 2 and depth.shape != (camera.height, camera.width):  # kept at another size (mapping.scale)
         height, width = depth.shape
@@ -253,7 +271,10 @@ def _read_keyframe(folder: Path, digest: str, camera: PinholeCamera | None) -> P
         raise CheckpointError(f'{path}: is no keyframe of this run: its depth or pose is not finite')
     if type(spacing) is not float or not 1 <= spacing < math.inf:
         raise CheckpointError(f'{path}: is no keyframe of this run: spacing = {spacing!r}, expected at least 1')
-    return PosedView(View(camera, torch.from_numpy(rgb8), torch.from_numpy(depth), spacing), torch.from_numpy(T_cam_world))
+    if type(frame) is not int:
+        raise CheckpointError(f'{path}: is no keyframe of this run: its frame is {frame!r}')
+    view = View(camera, torch.from_numpy(rgb8), torch.from_numpy(depth), spacing)
+    return PosedView(view, torch.from_numpy(T_cam_world), frame)
 
 
 def _keyframe_path(folder: Path, digest: str) -> Path:

@@ -9,20 +9,27 @@ from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import numpy as np
+
 from splatam_core.atomic_io import open_regular
 from splatam_core.errors import one_line
 from splatam_core.geometry.trajectory import Trajectory, pose_line, stamp_from_text, stamp_text, trajectory_from_rows
-from splatam_core.types import FrameResult, StageTimings, Status
+from splatam_core.types import FrameResult, PoseCovariance, StageTimings, Status
 
 _log = logging.getLogger(__name__)
 
 STAGES = tuple(entry.name for entry in fields(StageTimings))
 LOST = '# lost '
 """Begins the line of a lost frame in ``trajectory.txt``; for other programs the line is a comment."""
+AXES = 'x', 'y', 'z', 'rx', 'ry', 'rz'
+UPPER = tuple((row, column) for row in range(6) for column in range(row, 6))
+"""The entries of a symmetric [6, 6] matrix that are written."""
 CSV_HEADER = [
     'stamp', 'status', 'is_keyframe', 'num_gaussians', 'visible_fraction', 'inlier_fraction', 'process_ms', 'decode_ms',
     *(f'{stage}_ms' for stage in STAGES), 'reason',
+    'num_held', 'drift_position_m', 'drift_rotation_rad', *(f'cov_{AXES[row]}_{AXES[column]}' for row, column in UPPER),
 ]  # fmt: skip
+"""Columns are only ever added at the end: a folder of an earlier version can then be continued."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +38,7 @@ class FrameRecord:
 
     Attributes:
         stamp_ns: the frame's stamp.
-        status: initialized, tracked or lost.
+        status: initialized, tracked, uncertain or lost.
         is_keyframe: True if the frame was kept for mapping.
         num_gaussians: size of the map after the frame.
         visible_fraction: see ``FrameResult``.
@@ -39,7 +46,9 @@ class FrameRecord:
         process_ms: wall time in SLAM.
         decode_ms: wall time to read and decode the frame; None where another thread did that during SLAM.
         timings: wall time of each stage.
-        reason: why the frame is lost; empty otherwise.
+        reason: why the frame is uncertain or lost; empty otherwise.
+        covariance: see ``FrameResult``.
+        num_held: see ``FrameResult``.
     """
 
     stamp_ns: int
@@ -52,6 +61,8 @@ class FrameRecord:
     decode_ms: float | None
     timings: StageTimings
     reason: str
+    covariance: PoseCovariance | None = None
+    num_held: int = 0
 
     @classmethod
     def of(cls, result: FrameResult, process_s: float, decode_s: float | None) -> FrameRecord:
@@ -73,6 +84,8 @@ class FrameRecord:
             decode_ms=None if decode_s is None else decode_s * 1e3,
             timings=result.timings,
             reason=result.reason,
+            covariance=result.covariance,
+            num_held=result.num_held,
         )
 
     def csv_row(self) -> list[str]:
@@ -82,8 +95,16 @@ class FrameRecord:
             stamp_text(self.stamp_ns), self.status.value, str(int(self.is_keyframe)), str(self.num_gaussians),
             f'{self.visible_fraction:.4f}', f'{self.inlier_fraction:.4f}', f'{self.process_ms:.3f}',
             '' if self.decode_ms is None else f'{self.decode_ms:.3f}', *(f'{time_ms:.3f}' for time_ms in times_ms),
-            self.reason,
+            self.reason, str(self.num_held), *_covariance_cells(self.covariance),
         ]  # fmt: skip
+
+
+def _covariance_cells(covariance: PoseCovariance | None) -> list[str]:
+    """Returns the cells of a covariance, the sum of both kinds of error; empty where there is none."""
+    if covariance is None:
+        return [''] * (2 + len(UPPER))
+    entries = [covariance.total[entry] for entry in UPPER]
+    return [f'{number:.6g}' for number in (covariance.drift_position_m, covariance.drift_rotation_rad, *entries)]
 
 
 def trajectory_line(result: FrameResult) -> str:
@@ -185,4 +206,17 @@ def _frame_record(row: dict[str, str]) -> FrameRecord:
         decode_ms=_number(row['decode_ms']) if row['decode_ms'] else None,
         timings=StageTimings(*(_number(row[f'{stage}_ms']) for stage in STAGES)),
         reason=row['reason'],
+        covariance=_covariance(row),
+        num_held=int(row.get('num_held') or 0),
     )
+
+
+def _covariance(row: dict[str, str]) -> PoseCovariance | None:
+    """Returns the covariance in a row; None where there is none, as in folders of 0.1.0."""
+    if not row.get('drift_position_m'):
+        return None
+    drift_m, drift_rad = _number(row['drift_position_m']), _number(row['drift_rotation_rad'])
+    total = np.zeros((6, 6))
+    for i, k in UPPER:
+        total[i, k] = total[k, i] = _number(row[f'cov_{AXES[i]}_{AXES[k]}'])
+    return PoseCovariance(total - np.diag(np.repeat([drift_m**2, drift_rad**2], 3)), drift_m, drift_rad)

@@ -75,7 +75,7 @@ class Metrics:
 
     Attributes:
         frames: number of frames processed.
-        tracked: number of frames with a pose, the first included.
+        tracked: number of frames with a pose that may be trusted, the first included.
         lost: number of frames without a pose.
         fps: frames / time spent in SLAM, decoding excluded.
         fps_with_io: frames / time spent in SLAM and decoding; None where another thread decoded during SLAM.
@@ -84,8 +84,12 @@ class Metrics:
         timings_ms: wall time of each stage over the frames.
         finish_s: wall time of the final passes over the keyframes after the last frame; both rates include it.
         peak_gpu_mb: largest memory of its tensors on a GPU, MiB; None where no GPU was used.
-        ate_rmse_m: root mean squared distance of the camera centres to the ground truth, all tracked frames, SE(3)-aligned.
-        ate_frames: number of tracked frames with ground truth, which enter ``ate_rmse_m``.
+        uncertain: number of frames with a pose that may be wrong; they are not mapped.
+        ate_rmse_m: root mean squared distance of the camera centres to the ground truth, all frames with a pose, SE(3)-aligned.
+        ate_frames: number of frames with a pose and ground truth, which enter ``ate_rmse_m``.
+        ate_tracked_rmse_m: the same over the tracked frames alone, aligned by themselves.
+        worst_error_m: largest distance of a tracked frame's camera centre to the ground truth, aligned as ``ate_tracked_rmse_m``.
+        false_tracked: number of tracked frames that are farther off than 10 cm and than three standard deviations.
         splatam_ate_mean_m: what the original prints as "ATE RMSE".
         rpe_trans_frame_m: relative pose error from frame to frame, RMSE of the translation.
         rpe_rot_frame_deg: of the rotation.
@@ -124,8 +128,12 @@ class Metrics:
     timings_ms: Mapping[str, StageStatistics]
     finish_s: float = 0.0
     peak_gpu_mb: float | None = None
+    uncertain: int = 0
     ate_rmse_m: float | None = None
     ate_frames: int | None = None
+    ate_tracked_rmse_m: float | None = None
+    worst_error_m: float | None = None
+    false_tracked: int | None = None
     splatam_ate_mean_m: float | None = None
     rpe_trans_frame_m: float | None = None
     rpe_rot_frame_deg: float | None = None
@@ -193,7 +201,7 @@ class Metrics:
         """Raises ValueError where a value is not of its kind."""
         values = self.values() | {f'timings_ms.{name}': stage.median for name, stage in self.timings_ms.items()}
         values |= {f'timings_ms.{name}.p95': stage.p95 for name, stage in self.timings_ms.items()}
-        counts, other = ('frames', 'tracked', 'lost'), ('timings_ms', 'notes', 'novel_alignment')
+        counts, other = ('frames', 'tracked', 'uncertain', 'lost'), ('timings_ms', 'notes', 'novel_alignment')
         for name, value in values.items():
             is_number = type(value) in (int, float) and math.isfinite(value)
             is_right = type(value) is int if name in counts else value is None or is_number
@@ -225,11 +233,12 @@ class FrameStatistics:
 
     Attributes:
         frames: number of frames.
+        uncertain: number of frames with a pose that may be wrong.
         lost: number of frames without a pose.
     """
 
     def __init__(self, records: Iterable[FrameRecord] = ()) -> None:
-        self.frames = self.lost = 0
+        self.frames = self.uncertain = self.lost = 0
         self._process_ms = self._decode_ms = 0.0
         self._num_decoded = 0
         self._timings = array('d')  # of all frames, or of so many drawn at random
@@ -245,6 +254,7 @@ class FrameStatistics:
         elif (place := self._random.randrange(self.frames + 1)) < MAX_TIMINGS:  # Vitter 1985, algorithm R
             self._timings[place * len(STAGES) : (place + 1) * len(STAGES)] = timings
         self.frames += 1
+        self.uncertain += record.status is Status.UNCERTAIN
         self.lost += record.status is Status.LOST
         self._process_ms += record.process_ms
         if record.decode_ms is not None:
@@ -259,7 +269,8 @@ class FrameStatistics:
         process_ms = self._process_ms + 1e3 * finish_s
         return Metrics(
             frames=self.frames,
-            tracked=self.frames - self.lost,
+            tracked=self.frames - self.uncertain - self.lost,
+            uncertain=self.uncertain,
             lost=self.lost,
             fps=_rate(self.frames, process_ms),
             fps_with_io=_rate(self.frames, process_ms + self._decode_ms if self._num_decoded == self.frames else 0.0),

@@ -23,6 +23,7 @@ from splatam_core.runs.frame_records import FrameRecord, complete_lines, is_fram
 from splatam_core.runs.layout import CONFIG, FRAMES, MAP, METRICS, RUN, TRAJECTORY, why_not
 from splatam_core.runs.metrics import Metrics, run_metrics
 from splatam_core.text_files import read_json, read_text
+from splatam_core.types import PoseCovariance, Status
 
 KEEP_CHECKPOINTS = 2
 Made = TypeVar('Made')
@@ -116,7 +117,7 @@ class RunRecord(RunSettings):
     """A whole run folder.
 
     Attributes:
-        trajectory: the tracked frames.
+        trajectory: the frames with a pose, tracked and uncertain.
         lost_ns: stamps of the lost frames.
         frames: one record per frame; empty where there is no ``frames.csv``.
     """
@@ -129,15 +130,27 @@ class RunRecord(RunSettings):
         """Returns the stamps of all frames in order, lost ones included: the n-th is the one of frame n of the run."""
         return sorted([*map(int, self.trajectory.stamps_ns), *self.lost_ns])
 
+    def tracked_trajectory(self) -> Trajectory:
+        """Returns the frames whose pose may be trusted; all with a pose where there is no ``frames.csv``."""
+        uncertain = [frame.stamp_ns for frame in self.frames if frame.status is Status.UNCERTAIN]
+        kept = ~np.isin(self.trajectory.stamps_ns, uncertain)
+        return Trajectory(self.trajectory.stamps_ns[kept], self.trajectory.T_world_cam[kept])
+
+    def covariances(self) -> dict[int, PoseCovariance]:
+        """Returns the covariances of the poses, by stamp; those of frames without one are missing."""
+        return {frame.stamp_ns: frame.covariance for frame in self.frames if frame.covariance is not None}
+
     def poses(self) -> dict[int, NDArray[np.float64]]:
-        """Returns T_world_cam [4, 4] of the tracked frames, by stamp."""
+        """Returns T_world_cam [4, 4] of the frames with a pose, by stamp."""
         return dict(zip(map(int, self.trajectory.stamps_ns), self.trajectory.T_world_cam))
 
     def mapped_poses(self) -> dict[int, NDArray[np.float64]]:
-        """Returns the poses of the frames that were not held out of the map, by stamp."""
+        """Returns the poses of the tracked frames that were not held out of the map, by stamp."""
         is_held_out = self.config.mapping.is_held_out
         held_out = {stamp_ns for index, stamp_ns in enumerate(self.stamps_ns()) if is_held_out(index)}
-        return {stamp_ns: pose for stamp_ns, pose in self.poses().items() if stamp_ns not in held_out}
+        tracked = self.tracked_trajectory()
+        poses = zip(map(int, tracked.stamps_ns), tracked.T_world_cam)
+        return {stamp_ns: pose for stamp_ns, pose in poses if stamp_ns not in held_out}
 
     def read_map(self) -> Gaussians:
         """Reads the map.

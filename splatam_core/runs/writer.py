@@ -343,7 +343,13 @@ def _trim(path: Path, num_frames: int, last_stamp_ns: int | None) -> None:
         for name in RESULTS:
             (path / name).unlink(missing_ok=True)
         replace_text(path / TRAJECTORY, ''.join(trajectory))
-        replace_text(path / FRAMES, ''.join(frames))
+        replace_text(path / FRAMES, _present_header(frames[0]) + ''.join(frames[1:]))
+
+
+def _present_header(line: str) -> str:
+    """Returns the first line of a ``frames.csv`` with the columns that were added since it was written."""
+    columns = line.strip().split(',')
+    return ','.join([*columns, *CSV_HEADER[len(columns) :]]) + '\n'
 
 
 def _metrics_of_this_process(statistics: FrameStatistics, num_gaussians: int, finish_s: float = 0.0) -> Metrics:

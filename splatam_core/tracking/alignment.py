@@ -103,6 +103,7 @@ class AlignmentTracker:
             visible_fraction=system.compared / max(1, num_readings),
             inlier_fraction=system.agreeing / max(1, system.compared),
             time_offset=alignment.time_offset,
+            evidence=alignment.evidence,
         )
 
     def _reference_pyramid(self, frame: _Frame, T_cam_world: Matrix) -> list[Level]:

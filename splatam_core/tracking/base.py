@@ -8,6 +8,7 @@ from typing import Protocol
 from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians
+from splatam_core.tracking.evidence import Evidence
 from splatam_core.tracking.time_offset import TimeOffset
 
 
@@ -22,6 +23,7 @@ class TrackingResult:
         visible_fraction: fraction of the pixels with a depth reading that see the map at the pose.
         inlier_fraction: fraction of those that agree with the map in depth and colour.
         time_offset: between colour and depth, after this frame.
+        evidence: how far the pose may be trusted; None for a tracker that does not say.
     """
 
     T_cam_world: Matrix
@@ -30,6 +32,7 @@ class TrackingResult:
     visible_fraction: float
     inlier_fraction: float
     time_offset: TimeOffset = TimeOffset()
+    evidence: Evidence | None = None
 
 
 class Tracker(Protocol):

@@ -14,6 +14,7 @@ from splatam_core.config import TrackingConfig
 from splatam_core.geometry import se3
 from splatam_core.geometry.se3 import Matrix
 from splatam_core.tracking.aligner import Aligner, Array, LinearSystem
+from splatam_core.tracking.evidence import Evidence, Linearization, weigh
 from splatam_core.tracking.pyramid import EDGE, Level
 from splatam_core.tracking.time_offset import TimeOffset
 
@@ -88,11 +89,13 @@ class Alignment:
         state: the state.
         system: the residuals at the finest level.
         time_offset: between colour and depth, after this frame.
+        evidence: what the residuals say about the state.
     """
 
     state: AlignmentState
     system: LinearSystem
     time_offset: TimeOffset
+    evidence: Evidence
 
 
 class GaussNewton:
@@ -136,10 +139,10 @@ class GaussNewton:
         after = time_offset
         if self._estimates_time_offset:
             after = time_offset.updated(state.time_offset, self._time_offset_information(system))
-        return self._better(
-            Alignment(start, self._linearize(pair, start, scales), time_offset),
-            Alignment(state, system, after),
-        )
+        at_start = self._linearize(pair, start, scales)
+        if not _is_better(at_start, system):
+            return Alignment(start, at_start, time_offset, self._weigh(pair, start, scales))
+        return Alignment(state, system, after, self._weigh(pair, state, scales))
 
     def _iterate(
         self, pair: _Pair, state: AlignmentState, scales: tuple[float, float]
@@ -160,11 +163,7 @@ class GaussNewton:
 
     def _linearize(self, pair: _Pair, state: AlignmentState, scales: tuple[float, float]) -> LinearSystem:
         config, reference = self._config, pair.reference
-        # What lies between readings repeats their errors, so that all of it counts as much as the readings alone.
-        weights = config.color_weight, config.depth_weight * pair.depth_share
-        photometric_scale, depth_scale = (
-            scale / math.sqrt(max(weight, _LEAST_WEIGHT)) for scale, weight in zip(scales, weights, strict=True)
-        )
+        photometric_scale, depth_scale = self._weighted(pair, scales)
         return self._aligner.linearize(
             reference.brightness,
             reference.depth,
@@ -188,13 +187,41 @@ class GaussNewton:
         (t,), H = _TIME_OFFSET, system.H + np.diag(np.append(_PRIOR, 0.0))
         return float(system.H[t, t] - H[t, others] @ np.linalg.solve(H[np.ix_(others, others)], H[others, t]))
 
-    def _better(self, start: Alignment, found: Alignment) -> Alignment:
-        """Returns the alignment of lower cost. A point that is not seen costs as much as the average one at the start."""
-        unseen_cost = start.system.cost / max(1, start.system.seen)
-        is_better = 2 * found.system.seen > start.system.seen and (
-            _total_cost(found.system, unseen_cost) < _total_cost(start.system, unseen_cost)
+    def _weighted(self, pair: _Pair, scales: tuple[float, float]) -> tuple[float, float]:
+        """Returns the scales of the residuals of brightness and depth, divided by the roots of their weights."""
+        # What lies between readings repeats their errors, so that all of it counts as much as the readings alone.
+        weights = self._config.color_weight, self._config.depth_weight * pair.depth_share
+        color, depth = (scale / math.sqrt(max(weight, _LEAST_WEIGHT)) for scale, weight in zip(scales, weights, strict=True))
+        return color, depth
+
+    def _weigh(self, pair: _Pair, state: AlignmentState, scales: tuple[float, float]) -> Evidence:
+        reference = pair.reference
+        at = Linearization(
+            camera=reference.camera,
+            brightness=_on_host(reference.brightness),
+            depth=_on_host(reference.depth),
+            layers=_on_host(pair.layers),
+            color_motion=state.color_motion,
+            depth_motion=state.depth_motion,
+            velocity=state.velocity,
+            gain=state.gain,
+            bias=state.bias,
+            scales=self._weighted(pair, scales),
+            prior=np.append(_PRIOR, pair.time_offset.information),
+            prior_inflation=pair.time_offset.inflation,
+            free=self._free,
         )
-        return found if is_better else start
+        return weigh(at, max_depth_ratio=2 * EDGE)
+
+
+def _on_host(image: Array | Tensor) -> Array:
+    return image.numpy(force=True) if isinstance(image, Tensor) else image
+
+
+def _is_better(start: LinearSystem, found: LinearSystem) -> bool:
+    """Returns whether an estimate has lower cost than the start. A point that is not seen costs the average of the start's."""
+    unseen_cost = start.cost / max(1, start.seen)
+    return 2 * found.seen > start.seen and _total_cost(found, unseen_cost) < _total_cost(start, unseen_cost)
 
 
 def _scales(system: LinearSystem) -> tuple[float, float]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -19,6 +20,30 @@ MAX_EXTRAPOLATION = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """Where the camera is expected.
+
+    Attributes:
+        T_world_cam: [4, 4].
+        T_world_cam_before: [4, 4] the pose that it follows from.
+        seconds: since then; infinite where that is not known.
+        is_guess: True if nothing is known about the motion since then.
+        is_measured: True if another sensor has measured it.
+    """
+
+    T_world_cam: Matrix
+    T_world_cam_before: Matrix
+    seconds: float
+    is_guess: bool = False
+    is_measured: bool = False
+
+    @property
+    def T_cam_world(self) -> Matrix:
+        """[4, 4] world to camera."""
+        return se3.inverse(self.T_world_cam)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class MotionState:
     """The state of a motion model.
 
@@ -28,6 +53,8 @@ class MotionState:
         T_world_cam: [4, 4] the last pose.
         velocity: [6] twist per second, in the camera's frame.
         time_offset: between colour and depth.
+        trusted_ns: stamp of the last pose that may be trusted; None where that is the last pose.
+        T_world_cam_trusted: [4, 4] that pose.
     """
 
     stamp_ns: int
@@ -35,6 +62,8 @@ class MotionState:
     T_world_cam: Matrix
     velocity: Matrix
     time_offset: TimeOffset = TimeOffset()
+    trusted_ns: int | None = None
+    T_world_cam_trusted: Matrix = field(default_factory=lambda: np.eye(4))
 
 
 class MotionModel:
@@ -55,6 +84,8 @@ class MotionModel:
         self._interval_ns = 0
         self._T_world_cam: Matrix = np.eye(4)
         self._velocity = np.zeros(6)  # twist per second, in the camera's frame
+        self._trusted_ns: int | None = None
+        self._T_world_cam_trusted: Matrix = np.eye(4)
         self.time_offset = TimeOffset()
 
     @property
@@ -64,7 +95,15 @@ class MotionModel:
 
     def state(self) -> MotionState:
         """Returns the state, for ``restore``."""
-        return MotionState(self._stamp_ns, self._interval_ns, self._T_world_cam, self._velocity, self.time_offset)
+        return MotionState(
+            stamp_ns=self._stamp_ns,
+            interval_ns=self._interval_ns,
+            T_world_cam=self._T_world_cam,
+            velocity=self._velocity,
+            time_offset=self.time_offset,
+            trusted_ns=self._trusted_ns,
+            T_world_cam_trusted=self._T_world_cam_trusted,
+        )
 
     def restore(self, state: MotionState) -> None:
         """Sets the state to that of another motion model.
@@ -77,26 +116,50 @@ class MotionModel:
             raise ValueError(f'{shapes}: expected (4, 4) and (6,)')
         self._stamp_ns, self._interval_ns = state.stamp_ns, state.interval_ns
         self._T_world_cam, self._velocity, self.time_offset = state.T_world_cam, state.velocity, state.time_offset
+        self._trusted_ns, self._T_world_cam_trusted = state.trusted_ns, state.T_world_cam_trusted
+
+    def predictions(self, stamp_ns: int) -> list[Prediction]:
+        """Returns where the camera is expected: from the last pose, and if that is uncertain, from the last one to be trusted."""
+        predictions = [self._prediction(stamp_ns, self._stamp_ns, self._T_world_cam)]
+        if self._trusted_ns is not None:
+            predictions.append(self._prediction(stamp_ns, self._trusted_ns, self._T_world_cam_trusted))
+        return predictions
+
+    def _prediction(self, stamp_ns: int, before_ns: int, T_before: Matrix) -> Prediction:
+        if not before_ns:
+            return Prediction(T_before, T_before, math.inf)
+        seconds = 1e-9 * (stamp_ns - before_ns)
+        if self._prior and (step := self._prior(before_ns, stamp_ns)) is not None:
+            return Prediction(T_before @ step, T_before, seconds, is_measured=True)
+        is_guess = self._constant_velocity and not self._velocity.any()
+        return Prediction(self._extrapolated(stamp_ns, before_ns, T_before), T_before, seconds, is_guess)
 
     def predict(self, stamp_ns: int) -> Matrix:
         """Returns the predicted pose [4, 4], camera to world, at a stamp."""
-        if self._prior and self._stamp_ns and (step := self._prior(self._stamp_ns, stamp_ns)) is not None:
-            return self._T_world_cam @ step
-        elapsed_ns = min(stamp_ns - self._stamp_ns, MAX_EXTRAPOLATION * self._interval_ns)
-        return self._T_world_cam @ se3.exp(self._velocity * elapsed_ns * 1e-9)
+        return self._prediction(stamp_ns, self._stamp_ns, self._T_world_cam).T_world_cam
 
-    def observe(self, stamp_ns: int, T_world_cam: Matrix) -> None:
-        """Records the pose of a frame."""
+    def _extrapolated(self, stamp_ns: int, before_ns: int, T_before: Matrix) -> Matrix:
+        """Returns the pose [4, 4] to which the velocity leads, from that at an earlier stamp."""
+        elapsed_ns = min(stamp_ns - before_ns, MAX_EXTRAPOLATION * self._interval_ns)
+        return T_before @ se3.exp(self._velocity * elapsed_ns * 1e-9)
+
+    def observe(self, stamp_ns: int, T_world_cam: Matrix, *, is_trusted: bool = True) -> None:
+        """Records the pose of a frame. One that may be wrong is where the next prediction starts, but gives no velocity."""
+        if not is_trusted:
+            if self._trusted_ns is None:
+                self._trusted_ns, self._T_world_cam_trusted = self._stamp_ns, self._T_world_cam
+            self._stamp_ns, self._T_world_cam = stamp_ns, T_world_cam
+            return
         if self._constant_velocity and self._stamp_ns:
             step = se3.log(se3.inverse(self._T_world_cam) @ T_world_cam)
             self._interval_ns = stamp_ns - self._stamp_ns
             self._velocity = step / (self._interval_ns * 1e-9)
-        self._stamp_ns, self._T_world_cam = stamp_ns, T_world_cam
+        self._stamp_ns, self._T_world_cam, self._trusted_ns = stamp_ns, T_world_cam, None
 
     def place(self, T_world_cam: Matrix) -> None:
         """Sets the pose, at rest; the next frame may have any stamp."""
         self.stop()
-        self._stamp_ns, self._T_world_cam = 0, T_world_cam
+        self._stamp_ns, self._T_world_cam, self._trusted_ns = 0, T_world_cam, None
 
     def stop(self) -> None:
         """Sets the velocity to zero, because the motion of a lost camera is not known."""

@@ -1,9 +1,9 @@
 """The velocity and the covariances in ``nav_msgs/Odometry``.
 
-The tracker gives no covariance. The node states this instead: a pose that every pixel of the frame supports has the
-nominal standard deviations ``stddev.position`` and ``stddev.orientation`` relative to the map (parameters). Pixel errors
-count as independent, so the variance is divided by the fraction of the pixels that support the pose. Drift of the map is
-not included.
+Alignment estimates the covariance of each pose, with the drift of the map (``PoseCovariance``). For a tracker that estimates
+none the node states this: a pose that every pixel of the frame supports has the nominal standard deviations
+``stddev.position`` and ``stddev.orientation`` relative to the map (parameters). Pixel errors count as independent, so the
+variance is divided by the fraction of the pixels that support the pose. Drift of the map is not included then.
 """
 
 from __future__ import annotations
@@ -28,18 +28,20 @@ class Motion:
     """Velocity of a body, with covariances.
 
     Attributes:
-        pose_covariance: [6, 6] of x, y, z (m) and the rotations about x, y, z (rad), in map axes.
+        pose_covariance: [6, 6] of x, y, z (m) and the rotations about x, y, z (rad) of the body, in map axes.
+        camera_covariance: [6, 6] the same of the camera.
         twist: [6] linear (m/s) and angular (rad/s) velocity in body axes.
         twist_covariance: [6, 6] of the twist.
     """
 
     pose_covariance: Matrix
+    camera_covariance: Matrix
     twist: Vector
     twist_covariance: Matrix
 
 
 class MotionEstimator:
-    """Computes the velocity between consecutive tracked poses. Across a gap in tracking the velocity is unknown."""
+    """Computes the velocity between consecutive poses. Across a gap in tracking the velocity is unknown."""
 
     def __init__(self, stddev_position_m: float, stddev_orientation_rad: float) -> None:
         """Start without a previous pose.
@@ -56,20 +58,32 @@ class MotionEstimator:
         self._previous = None
 
     def observe(self, located: Located, result: FrameResult) -> Motion:
-        """Add a tracked pose and return its motion."""
-        covariance = self._pose_covariance(located, result.visible_fraction * result.inlier_fraction)
+        """Add a pose and return its motion."""
+        relative, total = self._camera_covariances(located, result)
+        to_body = _body_of_camera(located)
+        covariance, pose_covariance = to_body @ relative @ to_body.T, to_body @ total @ to_body.T
         previous, self._previous = self._previous, (located, covariance)
         if previous is None:
-            return Motion(covariance, np.zeros(6), UNKNOWN_VARIANCE * np.eye(6))
+            return Motion(pose_covariance, total, np.zeros(6), UNKNOWN_VARIANCE * np.eye(6))
         before, covariance_before = previous
         seconds = (located.stamp_ns - before.stamp_ns) * 1e-9
         twist = se3.log(se3.inverse(before.T_map_body) @ located.T_map_body) / seconds
         J = np.kron(np.eye(2), located.T_map_body[:3, :3].T)  # [6, 6] from map axes to body axes
-        return Motion(covariance, twist, J @ (covariance + covariance_before) @ J.T / seconds**2)
+        return Motion(pose_covariance, total, twist, J @ (covariance + covariance_before) @ J.T / seconds**2)
 
-    def _pose_covariance(self, located: Located, supporting_fraction: float) -> Matrix:
-        """Returns the [6, 6] covariance of the body: a rotation of the camera moves a body that is beside it."""
-        lever = located.T_map_body[:3, 3] - located.T_map_camera[:3, 3]
-        J = np.eye(6)
-        J[:3, 3:] = -se3.skew(lever)
-        return J @ np.diag(self._variances / max(supporting_fraction, 1e-3)) @ J.T
+    def _camera_covariances(self, located: Located, result: FrameResult) -> tuple[Matrix, Matrix]:
+        """Returns the [6, 6] covariances of the camera in map axes: relative to the map near it, and with the map's drift."""
+        if result.covariance is None:
+            supporting_fraction = result.visible_fraction * result.inlier_fraction
+            nominal = np.diag(self._variances / max(supporting_fraction, 1e-3))
+            return nominal, nominal
+        turn = np.kron(np.eye(2), located.T_map_world[:3, :3])
+        return turn @ result.covariance.relative @ turn.T, turn @ result.covariance.total @ turn.T
+
+
+def _body_of_camera(located: Located) -> Matrix:
+    """Returns the [6, 6] derivative of the body's pose by the camera's: a rotation of the camera moves a body beside it."""
+    lever = located.T_map_body[:3, 3] - located.T_map_camera[:3, 3]
+    J = np.eye(6)
+    J[:3, 3:] = -se3.skew(lever)
+    return J

@@ -7,6 +7,7 @@ if there is no base.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -150,6 +151,11 @@ class CoordinateFrames:
         if not odom_frame:
             return {(map_frame, located.body_frame): located.T_map_body}
         return {(map_frame, odom_frame): np.eye(4), (odom_frame, located.body_frame): located.T_map_body}
+
+    def lasting(self, moving: Mapping[Link, Matrix]) -> dict[Link, Matrix]:
+        """Returns those of the moving transforms that still hold while the camera is lost: the correction of the odometry."""
+        link = self._options.map_frame, self._options.odom_frame
+        return {link: moving[link]} if link in moving else {}
 
     def static(self, camera_frame: str) -> dict[Link, Matrix]:
         """Returns the transforms to publish on ``/tf_static``: the camera in the base, unless someone else publishes it."""

@@ -10,7 +10,7 @@ from splatam_core.types import RgbdFrame
 from splatam_ros.frames.buffer import TransformBuffer
 from splatam_ros.frames.odometry_prior import OdometryPrior, OdometrySubscription
 from splatam_ros.frames.options import FrameOptions
-from splatam_ros.frames.rep105 import CoordinateFrames, Located
+from splatam_ros.frames.rep105 import CoordinateFrames, Link, Located
 from splatam_ros.frames.tf_topics import TfTopics
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
@@ -44,6 +44,7 @@ class RobotFrames:
             ConfigError: the options contradict each other.
         """
         buffer = TransformBuffer()
+        self.begin_map()
         self._frames = CoordinateFrames(options, buffer, warnings)
         self._tf = TfTopics(node, options, buffer, warnings)
         if options.needs_tf_messages and not self._tf.is_available:
@@ -70,7 +71,17 @@ class RobotFrames:
         """Express a tracked camera in the coordinate frames of ROS; see ``CoordinateFrames.locate``."""
         return self._frames.locate(frame.stamp_ns, frame.frame_id, T_world_cam, T_map_world)
 
+    def begin_map(self) -> None:
+        """Forget where the odometry is in the map: a new one begins."""
+        self._held: dict[Link, Matrix] = {}
+
     def publish(self, located: Located) -> None:
         """Publish the transforms of a tracked camera."""
-        self._tf.publish(located.stamp_ns, self._frames.moving(located))
+        moving = self._frames.moving(located)
+        self._held = self._frames.lasting(moving) or self._held
+        self._tf.publish(located.stamp_ns, moving)
         self._tf.publish_static(located.stamp_ns, self._frames.static(located.camera_frame))
+
+    def hold(self, stamp_ns: int) -> None:
+        """Publish the last transform from map to odom once more, for a frame whose pose is uncertain or not known."""
+        self._tf.publish(stamp_ns, self._held)

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from rclpy.node import Node
 
 from msg_adapters import stamps
@@ -192,8 +193,16 @@ def tracking_report(now: Sample) -> Report:
         'inlier fraction': f'{result.inlier_fraction:.2f}',
         'stamp': f'{result.stamp_ns / 1e9:.6f}',
     }
+    values |= {
+        'position standard deviation (m)': _number(_deviation_m(result), 4),
+        'directions held by the prediction': str(result.num_held),
+    }
     if result.status is Status.LOST:
         return Report('tracking', ERROR, f'lost: {result.reason}', values)
+    if result.status is Status.UNCERTAIN:
+        return Report('tracking', WARN, f'uncertain: {result.reason}', values)
+    if result.num_held:
+        return Report('tracking', WARN, f'tracked; {result.num_held} of 6 directions are held by the prediction', values)
     return Report('tracking', OK, result.status.value, values)
 
 
@@ -243,6 +252,11 @@ def message(factory: MessageFactory, found: Sequence[Report], stamp_ns: int, nod
             for report in found
         ],
     )
+
+
+def _deviation_m(result: FrameResult) -> float | None:
+    """Returns the standard deviation of the position, over all axes; None where there is none."""
+    return None if result.covariance is None else float(np.sqrt(np.trace(result.covariance.total[:3, :3])))
 
 
 def _number(value: float | None, digits: int) -> str:

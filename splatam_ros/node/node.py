@@ -225,8 +225,8 @@ class SplatamNode(Node):
     def _on_result(self, frame: RgbdFrame, result: FrameResult) -> None:
         self._lifecycle.record(frame, result)  # before publishing: a frame that was answered is on disk
         self._counters.add(result, frame.frame_id)
-        if result.status is Status.LOST:
-            self._warnings.warn('lost', f'lost at {stamp_text(result.stamp_ns)}: {result.reason}')
+        if result.reason:
+            self._warnings.warn(result.status.value, f'{result.status.value} at {stamp_text(result.stamp_ns)}: {result.reason}')
         self._outputs.publish(result, self._lifecycle.locate(frame, result), self._slam)
         if result.T_world_cam is not None:
             self._counters.delay_s = (self.get_clock().now().nanoseconds - result.stamp_ns) / 1e9
@@ -243,6 +243,7 @@ class SplatamNode(Node):
         if is_first or time.monotonic() - self._progress_s > PROGRESS_S:
             self._progress_s = time.monotonic()
             self.get_logger().info(
-                f'{self._counters.total} frames, {self._counters.by_status[Status.LOST]} lost, '
+                f'{self._counters.total} frames, {self._counters.by_status[Status.UNCERTAIN]} uncertain, '
+                f'{self._counters.by_status[Status.LOST]} lost, '
                 f'{result.num_gaussians} Gaussians, {result.timings.total:.0f} ms for this frame'
             )

@@ -39,20 +39,21 @@ LATCHED_QOS = _qos(1, DurabilityPolicy.TRANSIENT_LOCAL)
 class Trigger(Enum):
     """When an output is published."""
 
-    POSE = 'with every pose'
-    SUBSCRIBED = 'with every pose while someone subscribes, limited by its rate'
+    TRACKED = 'with every tracked frame'
+    POSE = 'with every tracked or uncertain frame'
+    SUBSCRIBED = 'with every tracked frame while someone subscribes, limited by its rate'
 
 
 @dataclass(eq=False)
 class PublishContext:
-    """A tracked frame and everything that messages about it are made of. Costly parts are made when first used.
+    """A frame with a pose and everything that messages about it are made of. Costly parts are made when first used.
 
     Attributes:
         located: the camera in the coordinate frames of ROS.
         T_world_cam: [4, 4] camera to the core's world.
         motion: velocity and covariances.
         slam: SLAM in its state after the frame; the map may be rendered.
-        path: all poses so far.
+        path: all tracked poses so far.
         options: the node's options.
         factory: makes the messages.
     """
@@ -130,6 +131,12 @@ def _odometry(context: PublishContext) -> Any:
     )  # fmt: skip
 
 
+def _pose_with_covariance(context: PublishContext) -> Any:
+    return poses.pose_with_covariance(
+        context.factory, context.located.T_map_camera, context.motion.camera_covariance, context.stamp_ns, context.map_frame
+    )
+
+
 def _path(context: PublishContext) -> Any:
     return poses.path(context.factory, context.path.poses, context.stamp_ns, context.map_frame)
 
@@ -172,11 +179,13 @@ def _cloud_rate(options: NodeOptions) -> float:
 
 
 OUTPUTS = (
-    Output('pose', 'geometry_msgs/msg/PoseStamped', POSE_QOS, Trigger.POSE, _pose, 'pose of the camera in the map'),
+    Output('pose', 'geometry_msgs/msg/PoseStamped', POSE_QOS, Trigger.TRACKED, _pose, 'pose of the camera in the map'),
+    Output('pose_with_covariance', 'geometry_msgs/msg/PoseWithCovarianceStamped', POSE_QOS, Trigger.POSE, _pose_with_covariance,
+           'pose of the camera in the map, with its covariance, which is large while the pose is uncertain'),
     Output('odometry', 'nav_msgs/msg/Odometry', POSE_QOS, Trigger.POSE, _odometry,
            'pose of the base (of the camera, if there is no base) in the map, with velocity and covariances; see below'),
     Output('path', 'nav_msgs/msg/Path', LATCHED_QOS, Trigger.SUBSCRIBED, _path,
-           'all poses so far, thinned out evenly beyond `max_path_poses`; latched', rate_hz=_path_rate),
+           'all tracked poses so far, thinned out evenly beyond `max_path_poses`; latched', rate_hz=_path_rate),
     Output('render/rgb', 'sensor_msgs/msg/Image', IMAGE_QOS, Trigger.SUBSCRIBED, _rgb,
            'the map rendered from the pose of the camera', rate_hz=_render_rate),
     Output('render/depth', 'sensor_msgs/msg/Image', IMAGE_QOS, Trigger.SUBSCRIBED, _depth,
@@ -253,13 +262,17 @@ class Outputs:
         self._newest: PublishContext | None = None
         self._due_s: dict[str, float] = {}
         self._published_ns: dict[str, int] = {}
+        self._frames.begin_map()
 
     def interrupt_motion(self) -> None:
         """Report no velocity between the last pose and the next one, e.g. because time jumped."""
         self._motion.interrupt()
 
     def publish(self, result: FrameResult, located: Located | None, slam: Slam) -> None:
-        """Publish what is due for a frame, all with its stamp. Of a frame without a pose publish only ``~/processed``.
+        """Publish what is due for a frame, all with its stamp.
+
+        An uncertain frame goes to the topics that carry covariances; a lost one to none. For both the transform from map
+        to odom stays what it was, with the new stamp, so that a robot with odometry can go on.
 
         Args:
             result: result of the frame.
@@ -270,6 +283,8 @@ class Outputs:
             self._motion.interrupt()
         elif located is not None and self._node.context.ok():
             self._publish_pose(located, result.T_world_cam, result, slam)
+        if not result.status.is_trusted and self._node.context.ok():
+            self._frames.hold(result.stamp_ns)
         self.publish_processed(result.stamp_ns)
 
     def publish_processed(self, stamp_ns: int) -> None:
@@ -303,6 +318,9 @@ class Outputs:
             options=self._options,
             factory=self._factory,
         )
+        if not result.status.is_trusted:
+            self._publish_due(context, [row for row in self._publishers if row[0].trigger is Trigger.POSE])
+            return
         self._newest = context
         self._path.append(context.pose)
         self._frames.publish(located)
@@ -322,5 +340,5 @@ class Outputs:
         return self._node.create_publisher(message_class(type_name), f'~/{topic}', qos)
 
     def _is_due(self, output: Output, publisher: Publisher, now_s: float) -> bool:
-        is_wanted = output.trigger is Trigger.POSE or publisher.get_subscription_count() > 0
+        is_wanted = output.trigger is not Trigger.SUBSCRIBED or publisher.get_subscription_count() > 0
         return is_wanted and now_s >= self._due_s.get(output.topic, 0.0)

@@ -71,8 +71,8 @@ NODE_SETTINGS: tuple[Setting, ...] = (
              choices=('none', 'topic', 'tf')),
     _setting('odom.max_wait', 0.1, 'Longest wait for odometry that is newer than the frame. Increase when odometry arrives '
              'later than the images.', 's', 0.0, 10.0),
-    _setting('stddev.position', 0.02, 'Standard deviation of the position on ~/odometry when the whole frame agrees with the '
-             'map. Increase when a filter trusts the poses too much.', 'm', 1e-6, 100.0),
+    _setting('stddev.position', 0.02, 'For trackers that estimate no covariance: standard deviation of the position when the '
+             'whole frame agrees with the map. Increase when a filter trusts the poses too much.', 'm', 1e-6, 100.0),
     _setting('stddev.orientation', 0.01, 'Standard deviation of the orientation, likewise.', 'rad', 1e-6, 10.0),
     _setting('rgb_transport', 'raw', 'Transport of rgb/image; compressed = subscribe to rgb/image/compressed.',
              choices=('raw', 'compressed')),

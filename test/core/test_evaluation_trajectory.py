@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from splatam_core.errors import RunFolderError
+from splatam_core.evaluation.calibration import TruthNoise, adjoint, normalized_errors
 from splatam_core.evaluation.trajectory import (
     RelativePoseError,
     align,
     align_poses,
+    falsely_tracked,
     relative_pose_errors,
     splatam_ate_mean_m,
     trajectory_error,
@@ -23,6 +25,7 @@ from splatam_core.geometry.trajectory import (
     interpolate_centres,
     interpolate_poses,
 )
+from splatam_core.types import PoseCovariance
 
 EPOCH_NS = 1_700_000_000_123_456_789
 STEP_NS = 33_333_333
@@ -248,3 +251,49 @@ def test_aligned_poses_share_the_error() -> None:
     ground_truth = wandering(4)
     off = np.array([[0.03, 0, 0], [-0.03, 0, 0], [0, 0.03, 0], [0, -0.03, 0]])  # cancels out
     assert np.allclose(align_poses(ground_truth.T_world_cam, moved(ground_truth, off).T_world_cam), np.eye(4), atol=ROUND_OFF_M)
+
+
+# --- covariances ---
+
+
+def test_a_tracked_frame_is_false_beyond_ten_centimetres_and_three_deviations() -> None:
+    truth = wandering(1000)
+    poses = truth.T_world_cam.copy()
+    for index, off_m in ((10, 0.09), (11, 0.13), (12, 0.13), (13, 0.5)):
+        poses[index, 0, 3] += off_m
+    error = trajectory_error(Trajectory(truth.stamps_ns, poses), truth)
+    covariances = {
+        int(truth.stamps_ns[index]): PoseCovariance(np.diag([deviation_m**2, 0, 0, 0, 0, 0]), 0.0, 0.0)
+        for index, deviation_m in ((11, 0.02), (12, 0.06), (13, 0.06))
+    }
+    assert np.flatnonzero(falsely_tracked(error, covariances)).tolist() == [11, 13]
+
+
+def test_adjoints_move_twists_past_motions() -> None:
+    T, twist = se3.exp(np.array([1, -2, 0.5, 0.3, 0.2, -1])), np.array([0.1, 0.2, -0.3, 0.2, 0.1, 0.4])
+    np.testing.assert_allclose(se3.exp(adjoint(T) @ twist), T @ se3.exp(twist) @ se3.inverse(T), atol=1e-12)
+
+
+def test_errors_in_deviations_are_one_where_covariances_are_true() -> None:
+    """Monte Carlo: each pose is perturbed as its covariance says, and drifts; in the world's axes, with the camera turned."""
+    rng, truth = np.random.default_rng(0), wandering(2000)
+    relative = np.diag([0.004, 0.01, 0.002, 0.01, 0.003, 0.006]) ** 2
+    drift_m = drift_rad = 0.001  # per root of a frame
+    poses, covariances, drift = [], {}, np.eye(4)
+    for index, T in enumerate(truth.T_world_cam):
+        step, noise = rng.normal(size=6) * 0.001, rng.multivariate_normal(np.zeros(6), relative)
+        drift = drift @ T @ se3.exp(step) @ se3.inverse(T)  # at the camera, in its axes
+        moved = T.copy()
+        moved[:3, :3] = se3.exp(np.concatenate([np.zeros(3), noise[3:]]))[:3, :3] @ T[:3, :3]
+        moved[:3, 3] += noise[:3]
+        poses.append(drift @ moved)
+        turn = np.kron(np.eye(2), drift[:3, :3])
+        covariance = PoseCovariance(turn @ relative @ turn.T, drift_m * np.sqrt(index), drift_rad * np.sqrt(index))
+        covariances[int(truth.stamps_ns[index])] = covariance
+    estimate = Trajectory(truth.stamps_ns, np.array(poses))
+    errors = normalized_errors(estimate, truth, covariances)
+    assert len(errors) == 1990 and np.mean(errors**2) == pytest.approx(1, abs=0.1)  # 1990 pairs overlap: 200 are independent
+    assert np.median(errors) == pytest.approx(0.95, abs=0.05)
+    unsure = normalized_errors(estimate, truth, covariances, noise=TruthNoise(1.0, 1.0))
+    assert unsure.max() < 0.1
+    assert len(normalized_errors(estimate, truth, {})) == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
@@ -24,13 +25,13 @@ from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.maps.ply import read_ply
 from splatam_core.runs import provenance
-from splatam_core.runs.frame_records import FrameRecord
+from splatam_core.runs.frame_records import CSV_HEADER, FrameRecord
 from splatam_core.runs.layout import check_is_free
 from splatam_core.runs.metrics import MAX_TIMINGS, FrameStatistics, Metrics, StageStatistics, run_metrics
 from splatam_core.runs.record import RunDescription, Source, read_run
 from splatam_core.runs.writer import RunFolder
 from splatam_core.slam import Slam
-from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status
+from splatam_core.types import FrameResult, PoseCovariance, RgbdFrame, StageTimings, Status
 
 CAMERA = PinholeCamera(48, 36, 40.0, 40.0, 23.5, 17.5)
 CONFIG = load_config('quick', ['threads=1', 'tracking.iterations=3', 'mapping.iterations=2'])
@@ -84,6 +85,45 @@ def test_what_was_written_is_read_back(tmp_path: Path) -> None:
     assert run.frames[2].reason == results[2].reason
     assert (run.frames[0].process_ms, run.frames[0].decode_ms) == (250, 125)
     assert run.frames[1].timings == results[1].timings
+
+
+def uncertain(index: int) -> FrameResult:
+    """An uncertain frame, and a covariance of which no two entries are equal."""
+    root = np.random.default_rng(index).normal(size=(6, 6))
+    covariance = PoseCovariance(1e-4 * root @ root.T, 0.01 * index, 0.02 * index)
+    return dataclasses.replace(result(index), status=Status.UNCERTAIN, reason='too far', covariance=covariance, num_held=2)
+
+
+def test_verdicts_and_covariances_are_read_back_and_counted(tmp_path: Path) -> None:
+    results = [result(0, Status.INITIALIZED), result(1), uncertain(2), result(3, Status.LOST), uncertain(4)]
+    with RunFolder.create(tmp_path, CONFIG, OFFLINE) as folder:
+        for index, entry in enumerate(results):
+            folder.append(frame(index), entry, 0.25, 0.125)
+        metrics = folder.save(Slam(CONFIG))
+    assert (metrics.tracked, metrics.uncertain, metrics.lost) == (2, 2, 1)
+    run = read_run(tmp_path)
+    assert [record.status for record in run.frames] == [entry.status for entry in results]
+    assert [record.num_held for record in run.frames] == [0, 0, 2, 0, 2]
+    assert run.covariances().keys() == {results[2].stamp_ns, results[4].stamp_ns}
+    for entry in (results[2], results[4]):
+        found, expected = run.covariances()[entry.stamp_ns], entry.covariance
+        np.testing.assert_allclose(found.total, expected.total, rtol=1e-5)  # six digits are written
+        np.testing.assert_allclose(found.relative, expected.relative, rtol=1e-2, atol=1e-7)
+    assert [*run.poses()] == [results[index].stamp_ns for index in (0, 1, 2, 4)]  # an uncertain frame has a pose
+    assert [*run.mapped_poses()] == run.tracked_trajectory().stamps_ns.tolist() == [results[0].stamp_ns, results[1].stamp_ns]
+
+
+def test_a_folder_without_covariances_is_continued_with_them(tmp_path: Path) -> None:
+    with RunFolder.create(tmp_path, CONFIG, OFFLINE) as folder:
+        for index in range(2):
+            folder.append(frame(index), result(index), 0.25, 0.125)
+    rows = (tmp_path / 'frames.csv').read_text().splitlines()
+    count = CSV_HEADER.index('reason') + 1  # as in 0.1.0
+    (tmp_path / 'frames.csv').write_text(''.join(','.join(row.split(',')[:count]) + '\n' for row in rows))
+    with RunFolder.reopen(tmp_path, 2, result(1).stamp_ns) as folder:
+        folder.append(frame(2), uncertain(2), 0.25, 0.125)
+    frames = read_run(tmp_path).frames
+    assert [record.covariance is None for record in frames] == [True, True, False] and frames[2].num_held == 2
 
 
 def test_frames_of_an_older_version_are_read(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -335,9 +336,8 @@ def test_slam_starts_from_the_prior(robot: Robot) -> None:
         assert max(errors_m) < TRACKED_M if is_tracked else max(errors_m) > ASTRAY_M, errors_m
 
 
-@pytest.mark.parametrize('source', ['tf', 'topic'])
-def test_odometry_is_where_tracking_starts_and_is_corrected(graph: Graph, tf_message: type, robot: Robot, source: str) -> None:
-    camera, listener = Camera(graph), RobotListener(graph, tf_message)
+def start_with_odometry(graph: Graph, tf_message: type, robot: Robot, source: str) -> Process:
+    """Starts a node for a robot, and publishes all of its odometry."""
     wheels = graph.publisher(tf_message, '/tf', TF) if source == 'tf' else graph.publisher(Odometry, '/odom')
     slam = {f'slam.{name}': value for name, value in FAST.items()}
     node = graph.run_node(
@@ -358,6 +358,13 @@ def test_odometry_is_where_tracking_starts_and_is_corrected(graph: Graph, tf_mes
             wheels.publish(poses.odometry(
                 MAKE, T, stamp_ns, 'odom', 'base_link', pose_covariance=zeros, twist=zeros[0], twist_covariance=zeros
             ))  # fmt: skip
+    return node
+
+
+@pytest.mark.parametrize('source', ['tf', 'topic'])
+def test_odometry_is_where_tracking_starts_and_is_corrected(graph: Graph, tf_message: type, robot: Robot, source: str) -> None:
+    camera, listener = Camera(graph), RobotListener(graph, tf_message)
+    node = start_with_odometry(graph, tf_message, robot, source)
     sent = process(graph, node, camera, listener, robot.frames)
     map_odom = 'map', 'odom'
     graph.spin_until(lambda: len(listener.odometry) == len(sent) and sent[-1] in listener.moving.get(map_odom, {}),
@@ -371,6 +378,29 @@ def test_odometry_is_where_tracking_starts_and_is_corrected(graph: Graph, tf_mes
         # Odometry between two of its poses is interpolated along a screw; the walk is nearly that over 0.07 s.
         np.testing.assert_allclose(T_map_odom @ robot.odometry(stamp_ns), T_map_base[stamp_ns], atol=2e-3)
     assert set(listener.moving.get(('odom', 'base_link'), {})) <= set(robot.stamps_ns[::2])
+
+
+def test_the_correction_of_the_odometry_is_held_while_the_camera_is_covered(graph: Graph, tf_message: type, robot: Robot) -> None:
+    """Map to odom has the stamp of every frame, so that Nav2 can go on; it does not move until a frame is tracked again."""
+    camera, listener = Camera(graph), RobotListener(graph, tf_message)
+    node = start_with_odometry(graph, tf_message, robot, 'topic')
+    covered = {1, 2}
+    frames = [
+        replace(frame, rgb=0 * frame.rgb, depth_m=0 * frame.depth_m) if number in covered else frame
+        for number, frame in enumerate(robot.frames[:4])
+    ]
+    sent = process(graph, node, camera, listener, frames)
+    graph.spin_until(lambda: len(listener.moving.get(('map', 'odom'), {})) == len(sent), explain=lambda: node.text)
+    corrections = listener.moving['map', 'odom']
+    assert list(corrections) == sent
+    for number in covered:
+        assert_close(corrections[sent[number]], corrections[sent[0]])
+    assert np.abs(corrections[sent[3]] - corrections[sent[0]]).max() > 1e-3  # the drift of the meantime
+    graph.spin_until(lambda: len(listener.poses) == 2, explain=lambda: node.text)
+    found = by_stamp(listener.poses)
+    assert sorted(found) == [sent[0], sent[3]]
+    # 40 cm and 30 degrees on, from the odometry; it sees half of what the one mapped frame saw.
+    assert robot.error_m(sent[3], found[sent[3]]) < 2 * TRACKED_M
 
 
 def test_without_odometry_constant_velocity_and_one_warning(graph: Graph, tf_message: type, frames: SyntheticSequence) -> None:

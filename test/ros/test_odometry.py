@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatam_core.geometry import se3
-from splatam_core.types import FrameResult, StageTimings, Status
+from splatam_core.types import FrameResult, PoseCovariance, StageTimings, Status
 from splatam_ros.frames.covariance import UNKNOWN_VARIANCE, MotionEstimator
 from splatam_ros.frames.rep105 import Located
 from splatam_ros.node.outputs import PathHistory
@@ -74,6 +74,26 @@ def test_covariances_are_what_perturbed_poses_show(estimator: MotionEstimator) -
     for stated_covariance, samples in ((stated.pose_covariance, poses), (stated.twist_covariance, twists)):
         scale = np.sqrt(np.outer(np.diag(stated_covariance), np.diag(stated_covariance)))
         np.testing.assert_allclose(np.cov(np.array(samples).T) / scale, stated_covariance / scale, atol=0.12)
+
+
+def test_the_covariance_of_the_tracker_is_that_of_the_body_in_the_map() -> None:
+    """The turn of the map counts, the lever of the camera, and the drift; of the velocity only what is relative to the map."""
+    estimator = MotionEstimator(POSITION_M, ORIENTATION_RAD)
+    T_map_world = se3.exp(np.array([1, 2, 3, 0, 0, np.pi / 2]))  # the world's x axis is the map's y axis
+    relative = np.diag([1e-3, 2e-3, 3e-3, 1e-3, 1e-3, 1e-3]) ** 2
+    covariance = PoseCovariance(relative, drift_position_m=0.05, drift_rotation_rad=0.0)
+    motions = []
+    for tenths in range(2):
+        T_map_camera = T_map_world @ se3.exp(np.array([0.1 * tenths, 0, 0, 0, 0, 0]))
+        located = Located(10**9 + tenths * 10**8, 'camera', 'body', T_map_world, T_map_camera, T_map_camera, None)
+        result = FrameResult(
+            tenths, located.stamp_ns, Status.TRACKED, np.eye(4), False, 1, 1.0, 1.0, '', StageTimings(), covariance
+        )
+        motions.append(estimator.observe(located, result))
+    expected = np.square([2e-3, 1e-3, 3e-3, 1e-3, 1e-3, 1e-3]) + np.square([0.05, 0.05, 0.05, 0, 0, 0])
+    np.testing.assert_allclose(np.diag(motions[1].pose_covariance), expected, rtol=1e-9)
+    np.testing.assert_array_equal(motions[1].pose_covariance, motions[1].camera_covariance)
+    np.testing.assert_allclose(np.diag(motions[1].twist_covariance), 2 * np.diag(relative) / 0.1**2, rtol=1e-6)
 
 
 def test_a_path_is_bounded_even_and_ends_with_the_newest() -> None:

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from camera import CAMERA_FRAME, LATCHED, QUICK, Camera, run_node, still
+from camera import CAMERA_FRAME, LATCHED, QUICK, Camera, Live, run_node, still
+from control import Control
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from graph import Graph
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
@@ -73,9 +74,11 @@ def test_a_covered_camera_is_lost_in_silence_and_found_again(graph: Graph, tf_me
     done = graph.collect(Header, '/splatam/processed')
     heard = {
         'pose': graph.collect(PoseStamped, '/splatam/pose'), 'odometry': graph.collect(Odometry, '/splatam/odometry'),
-        'path': graph.collect(PathMessage, '/splatam/path', LATCHED), 'tf': graph.collect(tf_message, '/tf'),
+        'path': graph.collect(PathMessage, '/splatam/path', LATCHED),
+        'pose_with_covariance': graph.collect(PoseWithCovarianceStamped, '/splatam/pose_with_covariance'),
         'map/points': graph.collect(PointCloud2, '/splatam/map/points', LATCHED),
     }  # fmt: skip
+    moving = graph.collect(tf_message, '/tf')
     node = run_node(graph, queue_policy='all', publish_rate__path=0.0, publish_rate__cloud=0.0)
     camera.wait_matched()
     graph.spin_until(lambda: diagnostics.level('tracking') == WARN, explain=lambda: node.text)
@@ -89,7 +92,7 @@ def test_a_covered_camera_is_lost_in_silence_and_found_again(graph: Graph, tf_me
         send(still(frames, number))
     graph.spin_until(lambda: diagnostics.values('tracking')['frames tracked'] == '2', explain=lambda: node.text)
     assert diagnostics.level('tracking') == OK and diagnostics.values('tracking')['status'] == 'tracked'
-    graph.spin_until(lambda: len(heard['pose']) == len(heard['odometry']) == 3 and heard['tf'], explain=lambda: node.text)
+    graph.spin_until(lambda: len(heard['pose']) == len(heard['odometry']) == 3 == len(moving), explain=lambda: node.text)
     for latched in ('path', 'map/points'):  # a late subscriber gets the newest message
         graph.spin_until(lambda: newest_stamp(heard[latched]) == still(frames, 2).stamp_ns)  # noqa: B023
     assert float(diagnostics.values('tracking')['inlier fraction']) > 0.5
@@ -103,6 +106,8 @@ def test_a_covered_camera_is_lost_in_silence_and_found_again(graph: Graph, tf_me
     assert diagnostics.values('map')['Gaussians'] == gaussians
     graph.spin_for(0.5)
     assert {name: len(messages) for name, messages in heard.items()} == before
+    links = [[(transform.header.frame_id, transform.child_frame_id) for transform in message.transforms] for message in moving]
+    assert links[2:] == [[('map', 'odom'), ('odom', CAMERA_FRAME)], *[[('map', 'odom')]] * 3]  # where the camera is, nobody knows
 
     send(still(frames, 6))
     graph.spin_until(lambda: diagnostics.level('tracking') == OK, explain=lambda: node.text)
@@ -110,6 +115,35 @@ def test_a_covered_camera_is_lost_in_silence_and_found_again(graph: Graph, tf_me
     found = heard['odometry'][-1]
     assert found.twist.covariance[0] == 1e6  # the motion while lost is not known
     assert heard['odometry'][2].twist.covariance[0] < 1  # before the loss it was known
+
+
+def test_an_uncertain_frame_is_published_with_its_covariance_only(
+    graph: Graph, tf_message: type, frames: SyntheticSequence
+) -> None:
+    live, diagnostics, control = Live(graph, queue_policy='all'), Diagnostics(graph), Control(graph)
+    odometry = graph.collect(Odometry, '/splatam/odometry')
+    poses = graph.collect(PoseWithCovarianceStamped, '/splatam/pose_with_covariance')
+    moving = graph.collect(tf_message, '/tf')
+    live.wait(lambda: all(map(graph.node.count_publishers, ('/splatam/odometry', '/splatam/pose_with_covariance', '/tf'))))
+    assert live.show(still(frames, 0)) and live.show(still(frames, 1))
+    control.change(slam__tracking__max_error_m=1e-4)  # nothing is as sure as that
+    assert live.show(still(frames, 2)) is None
+    live.wait(lambda: diagnostics.level('tracking') == WARN and diagnostics['tracking'].message.startswith('uncertain: its pose'))
+    live.wait_says('WARN', 'uncertain at', 'its pose may be off by')
+    control.change(slam__tracking__max_error_m=1.0)
+    assert live.show(still(frames, 3))
+    sent = [still(frames, number).stamp_ns for number in range(4)]
+    live.wait(lambda: len(odometry) == len(poses) == len(moving) == 4)
+    assert [stamps.message_stamp_ns(message) for message in poses] == sent == [stamps.message_stamp_ns(m) for m in odometry]
+    assert [len(message.transforms) for message in moving] == [2, 2, 1, 2]
+    covariances = [np.array(message.pose.covariance).reshape(6, 6) for message in poses]
+    for covariance, message in zip(covariances, odometry):
+        assert (np.linalg.eigvalsh(covariance) > 0).all() and np.allclose(covariance, covariance.T)
+        np.testing.assert_allclose(message.pose.covariance, covariance.ravel(), rtol=1e-9)  # without a base, the camera's
+    assert np.sqrt(covariances[1][0, 0]) < 0.1
+    counts = diagnostics.values('tracking')
+    live.wait(lambda: diagnostics.values('tracking')['frames uncertain'] == '1')
+    assert set(counts) >= {'frames uncertain', 'position standard deviation (m)', 'directions held by the prediction'}
 
 
 def test_diagnostics_say_what_comes_and_goes(graph: Graph, frames: SyntheticSequence) -> None:

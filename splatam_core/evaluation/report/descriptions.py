@@ -80,7 +80,8 @@ def _original_scores(prefix: str) -> list[Description]:
 DESCRIPTIONS: dict[str, Sequence[Description]] = {
     'Run': (
         Description('frames', 'frames', '', 1, ',d', 'Frames processed.'),
-        Description('tracked', 'tracked', '', 1, ',d', 'Frames with a pose, including the first.'),
+        Description('tracked', 'tracked', '', 1, ',d', 'Frames with a pose that may be trusted, including the first.'),
+        Description('uncertain', 'uncertain', '', 1, ',d', 'Frames with a pose that may be wrong; they are not mapped.'),
         Description('lost', 'lost', '', 1, ',d', 'Frames without a pose; they do not change the map.'),
         Description('fps', 'speed', 'fps', 1, '.2f', 'Frames divided by the time spent in SLAM, without decoding.'),
         Description(
@@ -100,7 +101,19 @@ DESCRIPTIONS: dict[str, Sequence[Description]] = {
             'ate_rmse_m', 'ATE RMSE', 'cm', 100, '.3f',
             'Root mean squared distance of the camera centres after rigid alignment.',
         ),
-        Description('ate_frames', 'frames with ground truth', '', 1, ',d', 'Tracked frames that the ATE is computed from.'),
+        Description(
+            'ate_frames', 'frames with ground truth', '', 1, ',d',
+            'Frames with a pose, tracked and uncertain, that the ATE is computed from.',
+        ),
+        Description(
+            'ate_tracked_rmse_m', 'ATE RMSE, tracked', 'cm', 100, '.3f',
+            'The same over the tracked frames alone, aligned by themselves.',
+        ),
+        Description('worst_error_m', 'worst tracked frame', 'cm', 100, '.2f', 'Largest position error of a tracked frame.'),
+        Description(
+            'false_tracked', 'false "tracked"', '', 1, ',d',
+            'Tracked frames that are farther off than 10 cm and than three standard deviations.',
+        ),
         Description(
             'rpe_trans_frame_m', 'RPE per frame', 'mm', 1e3, '.3f',
             'Translation error of the motion from one frame to the next.',

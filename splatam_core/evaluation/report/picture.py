@@ -101,7 +101,7 @@ def headline(evaluation: Evaluation) -> list[Headline]:
         Headline(number_text(m.psnr_db, 1, 2), 'dB', f'PSNR{every}'),
         Headline(number_text(m.ssim, 1, 3), '', 'SSIM'),
         Headline(number_text(m.depth_l1_m, 100, 2), 'cm', 'depth L1'),
-        Headline(f'{m.tracked}', f'of {m.frames}', 'frames tracked'),
+        Headline(f'{m.tracked}', f'of {m.frames}', f'tracked, {m.uncertain} uncertain' if m.uncertain else 'frames tracked'),
         Headline(number_text(m.fps, 1, 2), 'fps', 'without decoding'),
         Headline('\u2013' if m.num_gaussians is None else f'{m.num_gaussians:,}', '', 'Gaussians'),
         Headline(number_text(m.peak_rss_mb, 1 / 1024, 2), 'GiB', 'peak memory'),

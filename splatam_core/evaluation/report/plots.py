@@ -174,7 +174,7 @@ def stage_times(ax: Axes, evaluation: Evaluation, theme: Theme) -> None:
 
 
 def map_size(ax: Axes, evaluation: Evaluation, theme: Theme) -> None:
-    """Draw the number of Gaussians after each frame, with keyframes and lost frames marked."""
+    """Draw the number of Gaussians after each frame, with keyframes, uncertain and lost frames marked."""
     ax.set(title='Gaussians', xlabel='frame')
     records = evaluation.run.frames
     if not records:
@@ -185,8 +185,9 @@ def map_size(ax: Axes, evaluation: Evaluation, theme: Theme) -> None:
     ax.plot(count, color=theme.estimate, lw=1.3)
     keyframes = [index for index, record in enumerate(records) if record.is_keyframe]
     ax.plot(keyframes, count[keyframes], '.', ms=4, color=theme.ink, label=f'{len(keyframes)} keyframes')
-    for index in (index for index, record in enumerate(records) if record.status is Status.LOST):
-        ax.axvline(index, color=theme.lost, lw=0.8, alpha=0.5)
+    for status, color in ((Status.UNCERTAIN, theme.orange), (Status.LOST, theme.lost)):
+        for index in (index for index, record in enumerate(records) if record.status is status):
+            ax.axvline(index, color=color, lw=0.8, alpha=0.5)
     ax.set_ylim(bottom=0)
     ax.yaxis.set_major_formatter(EngFormatter(sep=''))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -279,8 +280,10 @@ def _with_gaps(
 
 
 def _mark_lost(ax: Axes, evaluation: Evaluation, theme: Theme) -> None:
-    for index, stamp_s in enumerate(seconds(evaluation, np.array(evaluation.run.lost_ns, dtype=np.int64))):
-        ax.axvline(stamp_s, color=theme.lost, lw=0.8, alpha=0.5, label='lost' if index == 0 else None, zorder=0)
+    uncertain_ns = [frame.stamp_ns for frame in evaluation.run.frames if frame.status is Status.UNCERTAIN]
+    for label, stamps_ns, color in (('uncertain', uncertain_ns, theme.orange), ('lost', evaluation.run.lost_ns, theme.lost)):
+        for index, stamp_s in enumerate(seconds(evaluation, np.array(stamps_ns, dtype=np.int64))):
+            ax.axvline(stamp_s, color=color, lw=0.8, alpha=0.5, label=label if index == 0 else None, zorder=0)
 
 
 def _line(ax: Axes, points: NDArray[np.float64], color: str, width: float, label: str) -> None:
