@@ -33,6 +33,7 @@ CHECK_GRAPH_S = 0.2
 LATE_SUBSCRIBERS_S = 5.0  # after the first image topic has a subscriber; discovery takes up to 3 s
 LINGER_S = 0.5  # at the end, for subscribers that acknowledge nothing: what they have not received is lost when we exit
 SHORTEST_MESSAGE = 4  # bytes of the CDR encapsulation
+REPLY_S = 0.3  # for the answer of the service ~/stop to arrive: ROS does not tell when it has
 BAR_FORMAT = '{percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s of the recording [{elapsed}<{remaining}{postfix}]'
 
 
@@ -104,6 +105,7 @@ class Player:
             started_s = time.monotonic()
             self._play_all()
         except _Stopped:
+            time.sleep(REPLY_S)
             return f'stopped; {self._summary(time.monotonic() - started_s)}'
         return self._summary(time.monotonic() - started_s)
 
