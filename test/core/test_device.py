@@ -162,7 +162,7 @@ def test_no_step_of_tracking_waits_for_the_device(room: Room, monkeypatch: pytes
             tracker.track(view, slam.map.gaussians, np.eye(4))
             waits[config.method, config.iterations] = device.waits.total() - before
     assert waits['render_and_compare', 1] == waits['render_and_compare', 5] <= 4  # where it starts, what it found
-    assert waits['align', 1] == 4  # one step, the two fits that decide, how many readings there are
+    assert waits['align', 1] == 7  # one step, the two fits that decide, how many readings there are, three images as evidence
 
 
 def test_renders_scores_and_files_come_from_the_device(room: Room, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
