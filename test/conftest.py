@@ -88,3 +88,10 @@ def room() -> Callable[..., SyntheticSequence]:
         return SyntheticSequence(seed=seed, noise=noise, frames=frames, width=width)
 
     return make
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports are files without content, because drawing one takes seconds; other tests draw and read them."""
+    for name in ('picture.write_report', 'html.write_html'):
+        monkeypatch.setattr(f'splatam_core.evaluation.report.{name}', lambda evaluation, path: path.write_text('not drawn'))

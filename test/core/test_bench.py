@@ -33,11 +33,9 @@ def bench(*arguments: object) -> int:
 
 
 @pytest.fixture
-def here(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+def here(monkeypatch: pytest.MonkeyPatch, undrawn: None) -> list[list[str]]:
     """Runs are made in this process and without pictures, because importing and drawing take longer; lists their words."""
     ran = []
-    monkeypatch.setattr('splatam_core.evaluation.report.picture.write_report', lambda evaluation, path: None)
-    monkeypatch.setattr('splatam_core.evaluation.report.html.write_html', lambda evaluation, path: path.write_text('page'))
 
     def run(command: list[str], stdout: object, check: bool) -> subprocess.CompletedProcess[str]:
         assert command[:3] == [sys.executable, '-m', 'splatam_core.cli'] and stdout is None and not check

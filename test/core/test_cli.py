@@ -212,6 +212,7 @@ def write_tum(folder: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('undrawn')
 def test_recording_without_truth_gives_null(tmp_path: Path) -> None:
     write_tum(tmp_path / 'tum')
     assert splatam('run', tmp_path / 'tum', *SETTINGS, '--out', tmp_path / 'run') == 0
@@ -220,6 +221,7 @@ def test_recording_without_truth_gives_null(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('undrawn')
 def test_a_damaged_frame_is_left_out_and_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_tum(tmp_path / 'tum')
     (tmp_path / 'tum' / 'rgb' / '2.png').write_bytes(b'not an image')
@@ -254,6 +256,7 @@ def test_a_run_that_never_finds_its_way_is_still_reported(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('undrawn')
 def test_too_few_frames_for_a_trajectory_error_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     window = ['--width', WIDTH, '--max-frames', 2]
     assert splatam('run', SOURCE, *window, *SETTINGS, '--out', tmp_path / 'run') == 0
@@ -278,6 +281,7 @@ def long_run(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], Path]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.usefixtures('undrawn')
 def test_interrupt_saves_what_was_done(long_run: tuple[subprocess.Popen[str], Path], number: signal.Signals) -> None:
     process, folder = long_run
     process.send_signal(number)
@@ -294,6 +298,7 @@ def test_interrupt_saves_what_was_done(long_run: tuple[subprocess.Popen[str], Pa
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('undrawn')
 def test_kill_keeps_the_trajectory(long_run: tuple[subprocess.Popen[str], Path]) -> None:
     process, folder = long_run
     process.kill()
@@ -326,6 +331,7 @@ def test_the_steps_after_the_last_frame_are_counted_and_are_not_of_a_run_that_wa
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('undrawn')
 def test_ctrl_c_while_the_map_is_fitted_once_more_saves_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -357,6 +363,7 @@ def test_evaluate_repeats_the_run_s_own_scores(finished: Path, copy: Path) -> No
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('undrawn')
 def test_node_and_command_line_are_scored_alike(finished: Path, of_the_node: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(of_the_node, tmp_path / 'node'))
     assert (folder / 'trajectory.txt').read_bytes() == (finished / 'trajectory.txt').read_bytes()
@@ -378,6 +385,7 @@ def write_truth(path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('undrawn')
 def test_truth_file_alone_gives_the_trajectory_error(finished: Path, of_the_node: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(of_the_node, tmp_path / 'node'))
     write_truth(tmp_path / 'truth.txt')
@@ -388,6 +396,7 @@ def test_truth_file_alone_gives_the_trajectory_error(finished: Path, of_the_node
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('undrawn')
 def test_truth_file_beside_the_run_s_own_images(finished: Path, copy: Path, tmp_path: Path) -> None:
     write_truth(tmp_path / 'truth.txt')
     assert splatam('evaluate', copy, '--truth', tmp_path / 'truth.txt') == 0
@@ -405,6 +414,7 @@ def test_truth_of_another_recording_is_an_error_that_changes_nothing(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('undrawn')
 def test_scores_stay_until_they_are_scored_again(copy: Path, of_the_node: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(of_the_node, tmp_path / 'node'))
     assert splatam('evaluate', folder, '--truth', SOURCE) == 0
@@ -424,6 +434,7 @@ def test_evaluate_of_no_run_is_one_line(tmp_path: Path, capsys: pytest.CaptureFi
 
 @pytest.mark.slow
 @pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
+@pytest.mark.usefixtures('undrawn')
 def test_converted_bag_gives_the_same_run(finished: Path, tmp_path: Path, storage: str) -> None:
     bag = tmp_path / 'bag'
     assert splatam('convert', SOURCE, bag, *SMALL, '--storage', storage) == 0
@@ -434,6 +445,7 @@ def test_converted_bag_gives_the_same_run(finished: Path, tmp_path: Path, storag
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('undrawn')
 def test_node_is_scored_with_the_bag_it_was_played(finished: Path, of_the_node: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(of_the_node, tmp_path / 'node'))
     assert splatam('convert', SOURCE, tmp_path / 'bag', *SMALL) == 0

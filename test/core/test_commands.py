@@ -211,6 +211,7 @@ def test_refine_makes_a_better_map_and_leaves_the_run_alone(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('undrawn')
 def test_refine_may_add_gaussians(run: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr('splatam_core.mapping.offline_refinement.DENSIFY_FROM', 20)
     monkeypatch.setattr('splatam_core.mapping.offline_refinement.DENSIFY_EVERY', 20)

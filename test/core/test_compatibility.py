@@ -98,6 +98,7 @@ def test_a_run_folder_is_evaluated(name: str, run: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('undrawn')
 def test_a_run_folder_is_rendered_exported_compared_and_refined(
     run: Path, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

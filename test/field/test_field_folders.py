@@ -74,6 +74,7 @@ def test_named_format_is_accepted(tmp_path, name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize('name', ['associations', 'pointer', 'missing, numbered', 'NeRFCapture offline', 'truth nan'])
+@pytest.mark.usefixtures('undrawn')
 def test_folder_is_run_and_scored(tmp_path, capsys, name):
     brought = FOLDERS[name]
     assert run(brought.write(tmp_path / 'in'), tmp_path / 'out') == 0
@@ -131,6 +132,7 @@ def test_given_truth_with_a_fault_leaves_the_image_scores(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('undrawn')
 def test_given_truth_is_read_as_the_recording_s_own(tmp_path):
     assert run(tum(tmp_path / 'in'), tmp_path / 'out', '--no-evaluate') == 0
     for name in ('truth nan', 'truth nanoseconds'):

@@ -12,6 +12,7 @@ import cv2
 import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -134,7 +135,7 @@ def _svg(figure: Figure, theme: Theme) -> str:
     """Returns the ``data:`` address of a figure's SVG; the same figure gives the same text."""
     buffer = io.BytesIO()
     with matplotlib.rc_context({**theme.style(), 'svg.hashsalt': 'report'}):
-        figure.savefig(buffer, format='svg', facecolor='none', metadata={'Date': None, 'Creator': None})
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={'Date': None, 'Creator': None})  # savefig would draw everything twice
     return data_address('image/svg+xml', buffer.getvalue())
 
 

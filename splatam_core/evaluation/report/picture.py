@@ -27,7 +27,7 @@ def write_report(evaluation: Evaluation, path: Path) -> None:
     with matplotlib.rc_context(LIGHT.style()):
         figure = draw_report(evaluation)
         with replaced(path) as temporary:
-            figure.savefig(temporary, format='png', dpi=DPI)
+            FigureCanvasAgg(figure).print_png(temporary)  # savefig would draw everything twice
 
 
 def draw_report(evaluation: Evaluation) -> Figure:
@@ -35,7 +35,7 @@ def draw_report(evaluation: Evaluation) -> Figure:
     samples = evaluation.images.samples if evaluation.images else ()
     samples_in = _samples_height_in(samples)
     heights = [HEADER_IN, PATHS_IN, *([samples_in] if samples else []), CURVES_IN]
-    figure = Figure(figsize=(WIDTH_IN, sum(heights)), facecolor=LIGHT.card, layout='constrained')
+    figure = Figure(figsize=(WIDTH_IN, sum(heights)), dpi=DPI, facecolor=LIGHT.card, layout='constrained')
     FigureCanvasAgg(figure)
     rows = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
     _draw_header(rows[0], evaluation)
