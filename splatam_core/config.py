@@ -34,7 +34,7 @@ WHERE = frozenset({'device', 'rasterizer', 'threads', 'keyframes.on_device'})
 class DepthConfig:
     """Which depth readings are used."""
 
-    min_m: float = setting(0.2, 'Ignore readings nearer than this.', unit='m', minimum=0.0)
+    min_m: float = setting(0.2, 'Ignore readings nearer than this. Increase when near readings are wrong.', unit='m', minimum=0.0)
     max_m: float = setting(100.0, 'Ignore readings farther than this. Decrease when far readings are noisy.', unit='m', minimum=0.0)
     edge_filter: float = setting(
         0.0,
@@ -53,13 +53,20 @@ class PaperTrackingConfig:
         2e-3, 'Adam step size of the translation. Increase when the camera moves fast.', unit='m', minimum=0.0
     )
     extend_above_m: float = setting(
-        0.0, 'Take as many steps again when the mean depth error over the image is above this; 0 = never.', unit='m', minimum=0.0
+        0.0,
+        'Take as many steps again when the mean depth error over the image is above this; 0 = never. Decrease when '
+        'fast motion leaves frames off.',
+        unit='m',
+        minimum=0.0,
     )
     use_silhouette: bool = setting(
         True, 'Compare only pixels where the map is opaque. Off: depth at every reading, colour at every pixel.'
     )
     depth_outlier_ratio: float = setting(
-        0.0, 'Ignore pixels whose depth error exceeds this many median errors; 0 = use all.', minimum=0.0
+        0.0,
+        'Ignore pixels whose depth error exceeds this many median errors; 0 = use all. Decrease when wrong readings '
+        'spoil the pose.',
+        minimum=0.0,
     )
     blended_depth: bool = setting(False, 'Compare the blended depth sum, as the original code does, instead of the expected depth.')
 
@@ -104,18 +111,33 @@ class TrackingConfig:
         40, 'Optimization steps per frame; with align, at most this many per resolution. Increase when the camera moves fast.',
         minimum=0, maximum=MAX_STEPS,
     )  # fmt: skip
-    scale: float = setting(1.0, 'Size at which frames are tracked, relative to the frame.', minimum=0.05, maximum=1.0)
-    color_weight: float = setting(0.5, 'Weight of the colour error.', minimum=0.0)
+    scale: float = setting(
+        1.0, 'Size at which frames are tracked, relative to the frame. Decrease to save time.', minimum=0.05, maximum=1.0
+    )
+    color_weight: float = setting(0.5, 'Weight of the colour error. Increase when surfaces are flat and textured.', minimum=0.0)
     depth_weight: float = setting(1.0, 'Weight of the depth error. Decrease when depth is noisy.', minimum=0.0)
     silhouette_threshold: float = setting(
-        0.99, 'Compare only pixels whose rendered silhouette is above this.', minimum=0.0, maximum=1.0
+        0.99,
+        'Compare only pixels whose rendered silhouette is above this. Decrease when fast turns leave few pixels to compare.',
+        minimum=0.0,
+        maximum=1.0,
     )
-    motion_model: str = setting('constant_velocity', 'Which pose tracking starts from.', choices=('constant_velocity', 'last_pose'))
+    motion_model: str = setting(
+        'constant_velocity',
+        'Which pose tracking starts from: constant_velocity = the motion between the last two poses goes on; '
+        'last_pose = the last one.',
+        choices=('constant_velocity', 'last_pose'),
+    )
     min_visible_fraction: float = setting(
-        0.2, 'A frame is lost when the map is visible at less than this fraction of its depth readings.', minimum=0.0, maximum=1.0
+        0.2,
+        'A frame is lost when the map is visible at less than this fraction of its depth readings. Decrease when '
+        'the camera turns fast, increase when wrong poses are taken.',
+        minimum=0.0,
+        maximum=1.0,
     )
     min_inlier_fraction: float = setting(
-        0.5, 'A frame is lost when less than this fraction of those pixels agrees with the map in depth and colour.',
+        0.5, 'A frame is lost when less than this fraction of those pixels agrees with the map in depth and colour. Decrease when '
+        'much of the view moves, increase when wrong poses are taken.',
         minimum=0.0, maximum=1.0,
     )  # fmt: skip
     max_error_m: float = setting(
@@ -131,9 +153,14 @@ class TrackingConfig:
         '(method align). Decrease when much of the view moves.',
         minimum=0.0, maximum=1.0,
     )  # fmt: skip
-    inlier_depth: float = setting(0.1, 'Depth agrees when it differs by at most this fraction of the reading.', minimum=0.0)
+    inlier_depth: float = setting(
+        0.1, 'Depth agrees when it differs by at most this fraction of the reading. Increase when depth is noisy.', minimum=0.0
+    )
     inlier_color: float = setting(
-        0.2, 'Colour agrees when it differs by at most this, as a mean over the channels in [0, 1].', minimum=0.0
+        0.2,
+        'Colour agrees when it differs by at most this, as a mean over the channels in [0, 1]. Increase when brightness '
+        'changes from frame to frame.',
+        minimum=0.0,
     )
     paper: PaperTrackingConfig = field(default_factory=PaperTrackingConfig)
     align: AlignmentConfig = field(default_factory=AlignmentConfig)
@@ -147,17 +174,29 @@ class DensificationConfig:
         1, 'Add Gaussians on every n-th mapped frame. Increase to save time.', unit='frames', minimum=1, maximum=MAX_FRAMES
     )
     min_visible_fraction: float = setting(
-        0.0, 'Add on the frames between as well, when the map is visible at less than this fraction of the readings.',
+        0.0, 'Add on the frames between as well, when the map is visible at less than this fraction of the readings. '
+        'Increase when new places are mapped late.',
         minimum=0.0, maximum=1.0,
     )  # fmt: skip
     scale: float = setting(
         1.0, 'Size at which Gaussians are added, relative to the frame. Decrease for fewer, larger Gaussians.',
         minimum=0.05, maximum=1.0,
     )  # fmt: skip
-    max_width: int = setting(0, 'Largest width at which Gaussians are added; 0 = no limit.', unit='px', minimum=0, maximum=MAX_PX)
-    silhouette_threshold: float = setting(0.5, 'Add where the rendered silhouette is below this.', minimum=0.0, maximum=1.0)
+    max_width: int = setting(
+        0,
+        'Largest width at which Gaussians are added; 0 = no limit. Decrease for fewer, larger Gaussians.',
+        unit='px',
+        minimum=0,
+        maximum=MAX_PX,
+    )
+    silhouette_threshold: float = setting(
+        0.5, 'Add where the rendered silhouette is below this. Increase when the map has gaps.', minimum=0.0, maximum=1.0
+    )
     depth_error_ratio: float = setting(
-        50.0, 'Also add where the reading lies in front of the map by more than this many median depth errors.', minimum=0.0
+        50.0,
+        'Also add where the reading lies in front of the map by more than this many median depth errors. Increase '
+        'for fewer Gaussians.',
+        minimum=0.0,
     )
     depth_noise_ratio: float = setting(
         0.0,
@@ -165,10 +204,13 @@ class DensificationConfig:
         'medians of the depth noise at its distance, which grows with the square of the depth. Increase for fewer Gaussians.',
         minimum=0.0,
     )
-    opacity: float = setting(0.5, 'Opacity of a new Gaussian.', minimum=0.01, maximum=0.99)
+    opacity: float = setting(
+        0.5, 'Opacity of a new Gaussian. Increase when new surfaces look transparent.', minimum=0.01, maximum=0.99
+    )
     bias_correction_rounds: int = setting(
         0,
-        'Rounds that move new Gaussians along their rays until the rendered depth matches the readings.',
+        'Rounds that move new Gaussians along their rays until the rendered depth matches the readings. Increase when new surfaces '
+        'are mapped too near or too far.',
         minimum=0,
         maximum=MAX_STEPS,
     )
@@ -182,7 +224,8 @@ class KeyframeConfig:
         5, 'Keep every n-th frame. Decrease when the camera moves fast.', unit='frames', minimum=1, maximum=MAX_FRAMES
     )
     at_least: int = setting(
-        0, 'Keep frames more often when a recording would give fewer keyframes than this; 0 = off. Live length is unknown.',
+        0, 'Keep frames more often when a recording would give fewer keyframes than this; 0 = off. Has no effect live, where the '
+        'length is unknown. Increase for short recordings.',
         minimum=0, maximum=MAX_FRAMES,
     )  # fmt: skip
     window: int = setting(
@@ -209,12 +252,16 @@ class KeyframeConfig:
         maximum=MAX_SAMPLES,
     )
     overlap_margin: int = setting(
-        20, 'Border of a keyframe inside which a sample does not overlap.', unit='px', minimum=0, maximum=MAX_PX
+        20,
+        'Border of a keyframe inside which a sample does not overlap. Decrease for small images.',
+        unit='px',
+        minimum=0,
+        maximum=MAX_PX,
     )
     budget: int = setting(
         0,
         'Largest number of keyframes; beyond it, the one whose neighbours in time are nearest to each other is dropped. '
-        '0 = no limit; set it for runs of hours.',
+        '0 = no limit. Set it for runs of hours; decrease to save memory.',
         unit='frames', minimum=0, maximum=MAX_FRAMES,
     )  # fmt: skip
     on_device: int = setting(
@@ -227,14 +274,24 @@ class KeyframeConfig:
 class PaperMappingConfig:
     """Settings of the paper's optimizer (``mapping.optimizer: paper``)."""
 
-    ssim_weight: float = setting(0.2, 'Weight of 1 - SSIM in the colour loss; the rest is the L1 error.', minimum=0.0, maximum=1.0)
+    ssim_weight: float = setting(
+        0.2,
+        'Weight of 1 - SSIM in the colour loss; the rest is the L1 error. Increase for sharper texture.',
+        minimum=0.0,
+        maximum=1.0,
+    )
     depth_outlier_ratio: float = setting(
-        0.0, 'Ignore readings whose depth error exceeds this many median errors; 0 = use all.', minimum=0.0
+        0.0,
+        'Ignore readings whose depth error exceeds this many median errors; 0 = use all. Decrease when wrong readings '
+        'spoil the map.',
+        minimum=0.0,
     )
     prune_every: int = setting(
-        20, 'Prune at steps 0, n, 2n, ... of a frame; 0 = never.', unit='steps', minimum=0, maximum=MAX_STEPS
+        20, 'Prune at steps 0, n, 2n, ... of a frame; 0 = never. Increase to save time.', unit='steps', minimum=0, maximum=MAX_STEPS
     )
-    prune_until: int = setting(20, 'Last step of a frame that may prune.', unit='steps', minimum=0, maximum=MAX_STEPS)
+    prune_until: int = setting(
+        20, 'Last step of a frame that may prune. Decrease to save time.', unit='steps', minimum=0, maximum=MAX_STEPS
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,7 +306,8 @@ class FusedMappingConfig:
     )
     prune_fraction: float = setting(
         0.0,
-        'Prune only when more than this fraction of the Gaussians would be removed, because pruning copies the map; 1 = never.',
+        'Prune only when more than this fraction of the Gaussians would be removed, because pruning copies the map; 1 = never. '
+        'Increase to save time.',
         minimum=0.0, maximum=1.0,
     )  # fmt: skip
 
@@ -262,19 +320,28 @@ class MappingConfig:
     every: int = setting(1, 'Map every n-th frame. Increase to save time.', unit='frames', minimum=1, maximum=MAX_FRAMES)
     hold_out: int = setting(
         0,
-        'Track every n-th frame, but keep it out of the map, to score the map on it; 0 = none.',
+        'Track every n-th frame, but keep it out of the map, to score the map on it; 0 = none. Decrease to score it on '
+        'more frames.',
         unit='frames',
         minimum=0,
         maximum=MAX_FRAMES,
     )
     iterations: int = setting(60, 'Optimization steps per mapped frame. Increase for a sharper map.', minimum=0, maximum=MAX_STEPS)
-    first_iterations: int = setting(0, 'Additional steps on the first frame.', minimum=0, maximum=MAX_STEPS)
-    scale: float = setting(
-        1.0, 'Size at which views are fitted and kept as keyframes, relative to the frame.', minimum=0.1, maximum=1.0
+    first_iterations: int = setting(
+        0, 'Additional steps on the first frame. Increase when tracking is poor at the start.', minimum=0, maximum=MAX_STEPS
     )
-    max_width: int = setting(0, 'Largest width at which views are fitted; 0 = no limit.', unit='px', minimum=0, maximum=MAX_PX)
+    scale: float = setting(
+        1.0,
+        'Size at which views are fitted and kept as keyframes, relative to the frame. Decrease to save time and memory.',
+        minimum=0.1,
+        maximum=1.0,
+    )
+    max_width: int = setting(
+        0, 'Largest width at which views are fitted; 0 = no limit. Decrease to save time.', unit='px', minimum=0, maximum=MAX_PX
+    )
     half_size_every: int = setting(
-        0, 'Fit the view at half its size in every n-th step of a frame, for a quarter of the work; 0 = never.',
+        0, 'Fit the view at half its size in every n-th step of a frame, for a quarter of the work; 0 = never. Decrease to '
+        'save time.',
         unit='steps', minimum=0, maximum=MAX_STEPS,
     )  # fmt: skip
     anisotropic: bool = setting(
@@ -293,19 +360,40 @@ class MappingConfig:
         'for runs of hours in new places. Each takes about 0.1 kB; increase when there is memory to spare.',
         minimum=0, maximum=MAX_GAUSSIANS,
     )  # fmt: skip
-    color_weight: float = setting(0.5, 'Weight of the colour loss.', minimum=0.0)
+    color_weight: float = setting(0.5, 'Weight of the colour loss. Increase when colours are blurred.', minimum=0.0)
     depth_weight: float = setting(1.0, 'Weight of the depth loss. Decrease when depth is noisy.', minimum=0.0)
-    means_rate: float = setting(1e-4, 'Adam step size of the centres.', unit='m', minimum=0.0)
-    rgb_rate: float = setting(2.5e-3, 'Adam step size of the colours.', minimum=0.0)
-    opacity_rate: float = setting(0.05, 'Adam step size of the opacity logits.', minimum=0.0)
-    scale_rate: float = setting(1e-3, 'Adam step size of the log scales.', minimum=0.0)
-    rotation_rate: float = setting(1e-3, "Adam step size of anisotropic Gaussians' unit quaternions.", minimum=0.0)
-    prune_opacity: float = setting(0.005, 'Prune Gaussians with a lower opacity than this.', minimum=0.0, maximum=1.0)
-    prune_scale: float = setting(0.1, 'Prune Gaussians wider than this fraction of the scene radius.', minimum=0.0)
+    means_rate: float = setting(
+        1e-4,
+        'Adam step size of the centres. Increase when frames have few steps, decrease when the map gets noisy.',
+        unit='m',
+        minimum=0.0,
+    )
+    rgb_rate: float = setting(
+        2.5e-3, 'Adam step size of the colours. Increase when frames have few steps, decrease when the map gets noisy.', minimum=0.0
+    )
+    opacity_rate: float = setting(
+        0.05,
+        'Adam step size of the opacity logits. Increase when frames have few steps, decrease when the map gets noisy.',
+        minimum=0.0,
+    )
+    scale_rate: float = setting(
+        1e-3,
+        'Adam step size of the log scales. Increase when frames have few steps, decrease when the map gets noisy.',
+        minimum=0.0,
+    )
+    rotation_rate: float = setting(
+        1e-3, "Adam step size of anisotropic Gaussians' unit quaternions. Increase when frames have few steps.", minimum=0.0
+    )
+    prune_opacity: float = setting(
+        0.005, 'Prune Gaussians with a lower opacity than this. Increase for fewer Gaussians.', minimum=0.0, maximum=1.0
+    )
+    prune_scale: float = setting(
+        0.1, 'Prune Gaussians wider than this fraction of the scene radius. Decrease when wide Gaussians blur the map.', minimum=0.0
+    )
     scene_radius_ratio: float = setting(
         3.0,
         'Scene radius = deepest reading of the first frame divided by this. It grows when a later frame sees so far that new '
-        'Gaussians would be pruned as too wide.',
+        'Gaussians would be pruned as too wide. Increase when wide Gaussians blur the map.',
         minimum=0.1,
     )
     paper: PaperMappingConfig = field(default_factory=PaperMappingConfig)
@@ -320,10 +408,12 @@ class MappingConfig:
 class SlamConfig:
     """Every setting of SLAM. The defaults are the paper's for Replica."""
 
-    seed: int = setting(0, 'Seed of every random choice.', minimum=0, maximum=MAX_SEED)
+    seed: int = setting(
+        0, 'Seed of every random choice. Set another one to see how much a result depends on chance.', minimum=0, maximum=MAX_SEED
+    )
     width: int = setting(
         0,
-        "Width to which 'splatam run' shrinks wider frames; --width takes precedence; 0 = as recorded.",
+        "Width to which 'splatam run' shrinks wider frames; --width takes precedence; 0 = as recorded. Decrease to save time.",
         unit='px',
         minimum=0,
         maximum=MAX_PX,

@@ -52,6 +52,22 @@ class Setting:
             raise ConfigError(f'{self.name} = {shown(value)}: expected {self._allowed()}')
         return value
 
+    @property
+    def shown_default(self) -> str:
+        """The default as it is written in YAML; ``empty`` for an empty text."""
+        return str(self.default).lower() if isinstance(self.default, bool) else str(self.default) or 'empty'
+
+    @property
+    def shown_choices(self) -> str:
+        """The allowed strings, separated by commas, the empty one in quotes; empty where any string is allowed."""
+        return ', '.join(choice or "''" for choice in self.choices)
+
+    @property
+    def shown_range(self) -> str:
+        """Type, bounds and unit for a table, for example ``float ≥ 0 m``."""
+        bounds = [f'{sign} {bound:g}' for sign, bound in (('≥', self.minimum), ('≤', self.maximum)) if bound is not None]
+        return ' '.join(part for part in (self.type.__name__, ', '.join(bounds), self.unit) if part)
+
     def _contains(self, number: float) -> bool:
         if isinstance(number, float) and not math.isfinite(number):
             return False
@@ -60,7 +76,7 @@ class Setting:
 
     def _allowed(self) -> str:
         if self.choices:
-            return 'one of ' + ', '.join(self.choices)
+            return f'one of {self.shown_choices}'
         kind = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'a text'}[self.type]
         bounds = [f'at least {self.minimum:g}'] if self.minimum is not None else []
         bounds += [f'at most {self.maximum:g}'] if self.maximum is not None else []

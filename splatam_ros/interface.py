@@ -1,6 +1,7 @@
-"""The node's topics and coordinate frames that are not in ``OUTPUTS`` or ``NODE_SETTINGS``, for the documentation.
+"""The node's inputs, shared outputs and coordinate frames, for the documentation.
 
-``tools/ros_reference.py`` writes these tables into docs/ros.md. A test compares them with a running node.
+The topics below the node's name are in ``node/outputs.py``, the parameters in ``node/parameters.py``; add new ones there.
+``tools/ros_reference.py`` writes all of these tables into docs/ros.md. A test compares them with a running node.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ INPUTS = (
     Topic('/tf', 'tf2_msgs/msg/TFMessage', 'odometry from which tracking starts, with `odom.source: tf`'),
 )  # fmt: skip
 
-OUTPUTS = (
+SHARED_OUTPUTS = (
     Topic('~/processed', 'std_msgs/msg/Header', 'stamp of a frame for which nothing more is published',
           'with every frame, also lost ones'),
     Topic('/tf', 'tf2_msgs/msg/TFMessage', 'see Frames',

@@ -39,7 +39,6 @@ THREADING = {'_thread', 'asyncio', 'concurrent', 'multiprocessing', 'threading'}
 MAY_THREAD = {'splatam_core.worker', 'splatam_ros.node.node', 'splatam_ros.player.read_ahead', 'splatam_ros.frames.buffer'}
 
 
-# Each wing and what it may import beside itself. What a wing may import, whatever stands above it may import, too.
 FLOORS: tuple[tuple[str, ...], ...] = (
     ('splatam_core.errors', 'splatam_core.atomic_io'),
     ('splatam_core.resources', 'splatam_core.settings', 'splatam_core.retired_settings', 'splatam_core.text_files'),
@@ -68,7 +67,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ('splatam_ros.node',),
     ('splatam_ros.entry', 'splatam_ros.demo', 'splatam_ros.launch'),
 )
-"""Wings from the ground up; wings of one floor do not import each other."""
+"""Wings from the ground up. A wing imports only from floors below its own."""
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,9 @@ import pytest
 
 from splatam_core import commands, datasets, rasterizer, tracking
 from splatam_core.cli import COMMANDS
-from splatam_core.config import settings
+from splatam_core.config import TrackingConfig, settings
 from splatam_core.datasets.registry import READERS
+from splatam_core.rasterizer import make_rasterizer
 from splatam_ros.cameras import CAMERAS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -55,6 +56,12 @@ def test_every_class_that_tracks_is_in_the_table() -> None:
         if inspect.isclass(value) and value.__module__ == module.__name__ and hasattr(value, 'track')
     }
     assert trackers - {tracking.Tracker} == set(tracking._TRACKERS.values())
+
+
+def test_every_tracker_is_made_and_called_alike() -> None:
+    for method in tracking._TRACKERS:
+        tracker = tracking.make_tracker(make_rasterizer('cpu', 1), TrackingConfig(method=method), threads=1)
+        assert inspect.signature(type(tracker).track) == inspect.signature(tracking.Tracker.track)
 
 
 # --- a rasterizer ---

@@ -51,10 +51,8 @@ def settings_page() -> str:
         if path != section:
             section = path
             lines += ['', f'## {path or "General"}', '', '| setting | default | allowed | what it does |', '|---|---|---|---|']
-        default = str(setting.default).lower() if isinstance(setting.default, bool) else setting.default
-        bounds = [f'{sign} {bound:g}' for sign, bound in (('≥', setting.minimum), ('≤', setting.maximum)) if bound is not None]
-        kind = ', '.join(setting.choices) or ' '.join([setting.type.__name__, ', '.join(bounds), setting.unit]).strip()
-        lines.append(f'| `{name}` | `{default}` | {kind} | {setting.help} |')
+        allowed = setting.shown_choices or setting.shown_range
+        lines.append(f'| `{name}` | `{setting.shown_default}` | {allowed} | {setting.help} |')
     return '\n'.join(lines) + '\n'
 
 

@@ -45,7 +45,7 @@ def inputs() -> str:
 def outputs() -> str:
     """Returns the table of published topics."""
     own = [(f'`~/{output.topic}`', output.type_name, output.trigger.value, output.help) for output in OUTPUTS]
-    shared = [(f'`{topic.name}`', topic.type_name, topic.when, topic.help) for topic in interface.OUTPUTS]
+    shared = [(f'`{topic.name}`', topic.type_name, topic.when, topic.help) for topic in interface.SHARED_OUTPUTS]
     return table(('topic', 'type', 'when', ''), [*own, *shared])
 
 
@@ -55,17 +55,9 @@ def parameters() -> str:
 
 
 def _parameter(setting: Setting) -> Sequence[str]:
-    default = str(setting.default).lower() if isinstance(setting.default, bool) else str(setting.default)
+    default = setting.shown_default if setting.default == '' else f'`{setting.shown_default}`'
     changes = '' if why_fixed(setting.name) else 'yes'
-    return f'`{setting.name}`', f'`{default}`' if default else 'empty', _allowed(setting), changes, setting.help
-
-
-def _allowed(setting: Setting) -> str:
-    if setting.choices:
-        return ', '.join(setting.choices)
-    pairs = ('≥', setting.minimum), ('≤', setting.maximum)
-    bounds = [f'{sign} {bound:g}' for sign, bound in pairs if bound is not None]
-    return ' '.join([setting.type.__name__, ', '.join(bounds), setting.unit]).strip()
+    return f'`{setting.name}`', default, setting.shown_choices or setting.shown_range, changes, setting.help
 
 
 def frames() -> str:

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from splatam_core.runs.metrics import Metrics
     from splatam_core.runs.record import RunRecord
 
+NOT_KNOWN = 'not known'
+
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_run_argument(parser)
@@ -166,7 +168,7 @@ def _score_novel_views(run: RunRecord, alignment: str) -> NovelViews:
 
 
 def print_summary(metrics: Metrics, folder: Path, left_out: int = 0) -> None:
-    """Prints the main numbers, one per line. left_out: number of frames that could not be used."""
+    """Prints the main numbers, one per line, and which are not known. left_out: number of frames that could not be used."""
     m, notes = metrics, metrics.notes
     rows = [
         ('tracked', f'{m.tracked} of {m.frames} frames{_not_tracked(m)}'),
@@ -189,8 +191,10 @@ def print_summary(metrics: Metrics, folder: Path, left_out: int = 0) -> None:
         rows.append(
             ('novel', f'PSNR {scores}; {m.novel_frames} views without holes; {m.novel_holes_frames} with holes are scored apart')
         )
-    rows += [('Gaussians', _text(m.num_gaussians, 1, ',', '')), ('results', str(folder))]
-    for name, value in rows:
+    rows.append(('Gaussians', _text(m.num_gaussians, 1, ',', '')))
+    unknown = [name for name, value in rows if value == NOT_KNOWN]
+    rows = [*(row for row in rows if row[0] not in unknown), *([(NOT_KNOWN, ', '.join(unknown))] if unknown else [])]
+    for name, value in [*rows, ('results', str(folder))]:
         print(f'{name:<10} {value}'.rstrip())
 
 
@@ -201,7 +205,7 @@ def _not_tracked(metrics: Metrics) -> str:
 
 def _relative(metrics: Metrics) -> str:
     if metrics.rpe_trans_frame_m is None:
-        return 'not known'
+        return NOT_KNOWN
     per_frame = f'{metrics.rpe_trans_frame_m * 1e3:.2f} mm, {metrics.rpe_rot_frame_deg:.3f} deg per frame'
     if metrics.rpe_trans_1s_m is None:
         return per_frame
@@ -210,7 +214,7 @@ def _relative(metrics: Metrics) -> str:
 
 def _text(value: float | None, factor: float, digits: str, unit: str, why_not: str | None = None) -> str:
     if value is None:
-        return f'not known: {why_not}' if why_not else 'not known'
+        return f'{NOT_KNOWN}: {why_not}' if why_not else NOT_KNOWN
     return f'{value * factor:{digits}} {unit}'.rstrip()
 
 

@@ -1,10 +1,13 @@
 """Depth with a grid of holes: how far apart its readings are, and how such an image is made smaller.
 
 Depth that was registered by forward warping from a smaller image has a reading at every second or third row and column only. A
-dense image has readings wherever the sensor sees a surface, and larger holes where it does not.
+dense image has readings wherever the sensor sees a surface, and larger holes where it does not. Readings are also missing along
+the edges of objects; where an image is small, these thin lines are a large part of it.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +17,13 @@ WINDOW = 12
 """Side in pixels of the square in which readings are counted. Grids of every second, third or fourth pixel fit into it."""
 
 MAX_THIN_HOLES = 0.1
-"""As a fraction of the surface: more holes of one or two pixels' width are a grid. Shadows and windows are wider."""
+"""As a fraction of the surface: more holes of one or two pixels' width may be a grid. Shadows and windows are wider."""
+
+MIN_LOCAL_HOLES = 0.08
+"""As a fraction of the surface around a pixel: half of what an empty row and an empty column take of a square of ``WINDOW``."""
+
+MIN_SPREAD = 0.91
+"""Fraction of the surface around which there are ``MIN_LOCAL_HOLES``. A grid has them all over it, edges of objects do not."""
 
 MAX_DENSITY = 0.5
 """Mean fraction of pixels with a reading, around the readings, below which they are a grid with wider holes."""
@@ -35,7 +44,7 @@ def reading_spacing(depth_m: NDArray[np.float32]) -> float:
     valid = (depth_m > 0) & (depth_m < np.inf)
     count, mask = np.count_nonzero(valid), valid.view(np.uint8)
     surface = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REFLECT)
-    has_thin_holes = count < (1 - MAX_THIN_HOLES) * cv2.countNonZero(surface)
+    has_thin_holes = count < (1 - MAX_THIN_HOLES) * cv2.countNonZero(surface) and _spread(surface, mask) >= MIN_SPREAD
     if not has_thin_holes and count >= MAX_DENSITY * valid.size:  # around the readings there are more of them than on average
         return 1.0
     spacing = spacing_of_grid(valid)
@@ -50,6 +59,20 @@ def spacing_of_grid(valid: NDArray[np.bool_]) -> float:
     mask = valid.view(np.uint8)
     density = cv2.boxFilter(mask, cv2.CV_32F, (WINDOW, WINDOW), normalize=True, borderType=cv2.BORDER_REFLECT)
     return max(1.0, cv2.mean(density, mask=mask)[0] ** -0.5)
+
+
+def _spread(surface: NDArray[Any], mask: NDArray[np.uint8]) -> float:
+    """Returns over what fraction of the surface the thin holes are spread (see ``MIN_SPREAD``).
+
+    Args:
+        surface: [H, W] 1 where there is a reading or a thin hole.
+        mask: [H, W] 1 where there is a reading.
+    """
+    count, num_holes = (
+        cv2.boxFilter(image, cv2.CV_32F, (WINDOW, WINDOW), normalize=False, borderType=cv2.BORDER_REFLECT)
+        for image in (surface, surface - mask)
+    )
+    return cv2.mean((num_holes >= MIN_LOCAL_HOLES * count).view(np.uint8), mask=surface)[0]
 
 
 def shrunk_readings(depth_m: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:

@@ -283,9 +283,12 @@ def read_errors(path: Path) -> Iterator[None]:
         RunFolderError: the path is no run folder, or the block raised such an error.
     """
     try:
+        exists = path.exists()
         missing = [name for name in (TRAJECTORY, CONFIG, RUN) if not (path / name).is_file()]
     except (OSError, ValueError) as error:
         raise RunFolderError(f'{path} cannot be read: {why_not(error)}') from None
+    if not exists:
+        raise RunFolderError(f'{path} is no run folder: it does not exist')
     if missing:
         raise RunFolderError(f'{path} is no run folder: it has no {", ".join(missing)}')
     try:

@@ -334,7 +334,7 @@ def _weakness(evidence: Evidence, covariance: Matrix, allowed_m: float, config: 
     """Returns why too little is known about the pose of a frame; empty where it is enough."""
     off = DEVIATIONS * max(_deviations(covariance))
     if not off <= allowed_m:
-        return f'its pose may be off by {100 * min(off, 99.0):.0f} cm (at most {100 * allowed_m:.0f} cm allowed)'
+        return f'its pose may be off by {100 * min(off, 99.0):.1f} cm (at most {100 * allowed_m:.1f} cm allowed)'
     explained = evidence.explained
     if explained < config.min_explained_fraction:
         return (

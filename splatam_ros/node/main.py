@@ -88,7 +88,7 @@ def _spin(executor: SingleThreadedExecutor, node: SplatamNode, stop: StopRequest
 def make_parser() -> argparse.ArgumentParser:
     """Returns the parser of the arguments that are not for ROS; there is only ``--help``."""
     lines = [
-        f'  {setting.name} ({setting.default!r}{" " + setting.unit if setting.unit else ""})\n'
+        f'  {setting.name} ({setting.shown_default}{f", {setting.unit}" if setting.unit else ""})\n'
         + textwrap.fill(_help(setting), HELP_COLUMNS, initial_indent=HELP_INDENT, subsequent_indent=HELP_INDENT)
         for setting in NODE_SETTINGS
     ]
@@ -96,13 +96,13 @@ def make_parser() -> argparse.ArgumentParser:
         PROGRAM,
         usage='%(prog)s [--ros-args -p NAME:=VALUE ... -r rgb/image:=/TOPIC ...]',
         description='RGB-D SLAM on the topics rgb/image, depth/image and rgb/camera_info.',
-        epilog='parameters (default); the SLAM settings have the prefix slam. and are not listed here:\n' + '\n'.join(lines),
+        epilog='parameters (default, unit); the SLAM settings have the prefix slam. and are not listed here:\n' + '\n'.join(lines),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
 
 
 def _help(setting: Setting) -> str:
-    return setting.help + (f' One of {", ".join(setting.choices)}.' if setting.choices else '')
+    return setting.help + (f' One of {setting.shown_choices}.' if setting.choices else '')
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

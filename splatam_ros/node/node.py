@@ -243,7 +243,7 @@ class SplatamNode(Node):
         if is_first or time.monotonic() - self._progress_s > PROGRESS_S:
             self._progress_s = time.monotonic()
             self.get_logger().info(
-                f'{self._counters.total} frames, {self._counters.by_status[Status.UNCERTAIN]} uncertain, '
-                f'{self._counters.by_status[Status.LOST]} lost, '
+                f'frame {self._counters.total}: {self._counters.by_status[Status.UNCERTAIN]} uncertain and '
+                f'{self._counters.by_status[Status.LOST]} lost so far, '
                 f'{result.num_gaussians} Gaussians, {result.timings.total:.0f} ms for this frame'
             )

@@ -73,14 +73,15 @@ NODE_SETTINGS: tuple[Setting, ...] = (
              'later than the images.', 's', 0.0, 10.0),
     _setting('stddev.position', 0.02, 'For trackers that estimate no covariance: standard deviation of the position when the '
              'whole frame agrees with the map. Increase when a filter trusts the poses too much.', 'm', 1e-6, 100.0),
-    _setting('stddev.orientation', 0.01, 'Standard deviation of the orientation, likewise.', 'rad', 1e-6, 10.0),
+    _setting('stddev.orientation', 0.01, 'For trackers that estimate no covariance: standard deviation of the orientation when '
+             'the whole frame agrees with the map. Increase when a filter trusts the poses too much.', 'rad', 1e-6, 10.0),
     _setting('rgb_transport', 'raw', 'Transport of rgb/image; compressed = subscribe to rgb/image/compressed.',
              choices=('raw', 'compressed')),
     _setting('depth_transport', 'raw', 'Transport of depth/image; compressedDepth = subscribe to '
              'depth/image/compressedDepth.',
              choices=('raw', 'compressedDepth')),
-    _setting('depth_scale', 0.001, 'Length of one step of 16-bit depth images. Drivers send millimetres (0.001), some '
-             'recordings other steps (TUM PNG files: 0.0002).', 'm', 1e-6, 1.0),
+    _setting('depth_scale', 0.001, 'Length of one step of 16-bit depth images. Set it when they are not in '
+             'millimetres (TUM PNG files: 0.0002).', 'm', 1e-6, 1.0),
     _setting('rgb_encoding', '', 'How to read images of encoding 8UC3 or 8UC4, which do not say the order of the channels; empty '
              '= bgr8, with a warning.', choices=('', 'bgr8', 'rgb8')),
     _setting('undistort', True, 'Undistort images by K and D of CameraInfo; false = the images are rectified (image_rect), '
@@ -98,12 +99,14 @@ NODE_SETTINGS: tuple[Setting, ...] = (
              'continue = keep the map and continue from the last pose.',
              choices=('reset', 'continue')),
     _setting('time_jump_threshold', 1.0, 'Stamps that fall back by more than this are a time jump; by less, the image is late '
-             'and dropped.', 's', 0.0, 3600.0),
+             'and dropped. Increase when images are delayed by more.', 's', 0.0, 3600.0),
     _setting('on_camera_change', 'reset', 'What to do when CameraInfo changes: reset = start a new map, refuse = drop frames of '
              'the other camera.',
              choices=('reset', 'refuse')),
-    _setting('lost_reset_after', 0.0, 'Start a new map after the camera was lost for this long; 0 = never.', 's', 0.0, 3600.0),
-    _setting('max_rate_hz', 0.0, 'Largest number of frames per second, by their stamps, that are passed to SLAM; 0 = all.',
+    _setting('lost_reset_after', 0.0, 'Start a new map after the camera was lost for this long; 0 = never. '
+             'Set it when the camera does not come back to where it was.', 's', 0.0, 3600.0),
+    _setting('max_rate_hz', 0.0, 'Largest number of frames per second, by their stamps, that are passed to SLAM; 0 = all. '
+             'Decrease to leave time to other processes.',
              'Hz', 0.0, 1000.0),
     _setting('input_reliability', 'auto', 'QoS reliability of the inputs; auto = reliable, or best effort if the publisher '
              'offers only that.',
@@ -115,13 +118,17 @@ NODE_SETTINGS: tuple[Setting, ...] = (
              'is uneven.', '', 1, 1000),
     _setting('max_cloud_points', 200_000, 'Largest number of points in a published cloud. Decrease when the network is slow.',
              '', 1, 50_000_000),
-    _setting('max_path_poses', 2000, 'Largest number of poses in a published path; a longer path is thinned out evenly.', '',
+    _setting('max_path_poses', 2000, 'Largest number of poses in a published path; a longer path is thinned out evenly. '
+             'Decrease when the network is slow.', '',
              2, 1_000_000),
-    _setting('publish_rate.path', 1.0, 'Largest rate of ~/path; 0 = with every pose.', 'Hz', 0.0, 1000.0),
+    _setting('publish_rate.path', 1.0, 'Largest rate of ~/path; 0 = with every pose. Decrease when the network '
+             'is slow.', 'Hz', 0.0, 1000.0),
     _setting('publish_rate.render', 0.0, 'Largest rate of ~/render/*; 0 = with every pose. Decrease to save time.', 'Hz', 0.0,
              1000.0),
-    _setting('publish_rate.cloud', 1.0, 'Largest rate of ~/map/points; 0 = with every pose.', 'Hz', 0.0, 1000.0),
-    _setting('no_data_timeout', 5.0, 'Warn, with the reason, when no frame was received for this long; 0 = never.', 's', 0.0,
+    _setting('publish_rate.cloud', 1.0, 'Largest rate of ~/map/points; 0 = with every pose. Decrease when the '
+             'network is slow.', 'Hz', 0.0, 1000.0),
+    _setting('no_data_timeout', 5.0, 'Warn, with the reason, when no frame was received for this long; 0 = never. Increase when '
+             'the camera often pauses.', 's', 0.0,
              3600.0),
     _setting('exit_on_publisher_end', False, 'Save and exit when the publishers of the images are gone and every frame is '
              'processed.'),
@@ -347,7 +354,7 @@ def _descriptor(setting: Setting, why_fixed: str) -> ParameterDescriptor:
     unit = f' [{setting.unit}]' if setting.unit else ''
     # Not read_only: ROS would refuse a change before the node can give the reason.
     descriptor = ParameterDescriptor(description=setting.help + unit)
-    constraints = ['one of ' + ', '.join(setting.choices)] if setting.choices else []
+    constraints = [f'one of {setting.shown_choices}'] if setting.choices else []
     constraints += [f'cannot change at run time: {why_fixed}'] if why_fixed else []
     descriptor.additional_constraints = '; '.join(constraints)
     if setting.minimum is None and setting.maximum is None:

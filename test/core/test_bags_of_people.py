@@ -392,6 +392,12 @@ def test_splits_without_metadata_are_read_in_order(tmp_path, whole, storage, cap
     assert 'there is no metadata.yaml, the recording was not closed; reading bag_10' in caplog.text
 
 
+def test_a_folder_that_is_no_bag_is_not_taken_for_an_open_one(tmp_path):
+    (tmp_path / 'rgb').mkdir()
+    with pytest.raises(DatasetError, match=r'cannot be read as a rosbag2: it holds no \.db3 or \.mcap file$'):
+        Recording(tmp_path)
+
+
 def file_of_suffix(storage):
     return {'sqlite3': '.db3', 'mcap': '.mcap'}[storage]
 

@@ -124,7 +124,7 @@ def test_run_says_how_it_went(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert splatam('run', SOURCE, *SMALL, *SETTINGS, '--no-evaluate', '--out', tmp_path / 'run') == 0
     output = capsys.readouterr()
     assert f'tracked    {FRAMES} of {FRAMES} frames' in output.out
-    assert 'ATE RMSE   not known' in output.out
+    assert 'not known  ATE RMSE, RPE, PSNR, SSIM' in output.out and output.out.count('not known') == 1
     assert f'{FRAMES}/{FRAMES}' in output.err and f'tracked={FRAMES}' in output.err and 'lost=0' in output.err
     assert not (tmp_path / 'run' / 'report.png').exists()
     assert metrics(tmp_path / 'run')['psnr_db'] is None
@@ -427,6 +427,8 @@ def test_scores_stay_until_they_are_scored_again(copy: Path, of_the_node: Path, 
 def test_evaluate_of_no_run_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert splatam('evaluate', tmp_path) == 2
     assert 'is no run folder' in capsys.readouterr().err
+    assert splatam('evaluate', tmp_path / 'nothing') == 2
+    assert 'nothing is no run folder: it does not exist' in capsys.readouterr().err
 
 
 # --- convert ---

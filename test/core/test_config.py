@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -176,3 +177,8 @@ def test_every_setting_is_documented_and_its_default_allowed() -> None:
     for setting in settings():
         assert setting.help.endswith('.'), setting.name
         assert setting.check(defaults[setting.name]) == setting.default
+
+
+def test_the_help_of_every_number_says_when_to_change_it() -> None:
+    numbers = [setting for setting in settings() if setting.type in (int, float)]
+    assert [setting.name for setting in numbers if not re.search(r'[Ii]ncrease|[Dd]ecrease|Set ', setting.help)] == []

@@ -142,7 +142,7 @@ def test_a_pose_that_is_poorly_determined_is_uncertain_and_says_so(bench: Bench)
     assert 1 < index < 30 and 'may be off by' in verdict.reason
     assert verdict.covariance is not None and np.sqrt(verdict.covariance.total[0, 0]) > bench.config.max_error_m
     verdict = bench.feed(*[result(at(HERE + STEP * (index + 1)), deviation=0.02)] * 2, after_ns=20 * FRAME_NS)  # nothing predicted
-    assert verdict.status is Status.UNCERTAIN and '4 cm allowed' in verdict.reason
+    assert verdict.status is Status.UNCERTAIN and '3.6 cm allowed' in verdict.reason
     assert bench.feed(*[result(at(HERE + STEP * (index + 2)), deviation=0.005)] * 2).status is Status.TRACKED
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -64,6 +65,34 @@ def test_depth_that_is_dense_where_the_sensor_sees_a_surface_is_no_grid() -> Non
     for dense in (depth_m, speckled, np.zeros_like(depth_m)):
         assert reading_spacing(dense) == 1.0
         assert new_widths(view_of(dense)) is None
+
+
+SMALL_WIDTHS = (48, 64, 80, 160, 320)
+
+
+def small_views(source: str | Path) -> Iterator[tuple[np.ndarray, float]]:
+    """Depth of some frames of a recording at all of ``SMALL_WIDTHS``, and the focal length there."""
+    for width in SMALL_WIDTHS:
+        sequence = open_sequence(str(source), width=width)
+        for index in range(0, min(len(sequence), 160), 80):
+            yield sequence[index].depth_m, sequence.camera.fx
+
+
+def assert_only_grids_are_grids(views: Iterator[tuple[np.ndarray, float]]) -> None:
+    """In a small image, the readings that are missing along the edges of objects are more than a tenth of the surface."""
+    for depth_m, focal in views:
+        assert reading_spacing(depth_m) == 1.0, depth_m.shape
+        for ratio, bent in [(1.1, False), (1.1, True), *GRIDS]:
+            assert reading_spacing(thinned(depth_m, ratio, focal if bent else None)) > 1.0, (depth_m.shape, ratio, bent)
+
+
+def test_noisy_edges_in_a_small_image_are_no_grid() -> None:
+    assert_only_grids_are_grids(small_views('synthetic'))
+
+
+@pytest.mark.parametrize('name', ['redkitchen_320', 'fr1_rpy_320', 'd435_desk'])
+def test_missing_readings_in_a_small_recording_are_no_grid(recording, name: str) -> None:
+    assert_only_grids_are_grids(small_views(recording(name)))
 
 
 @pytest.mark.parametrize(('ratio', 'size'), [(2, (160, 120)), (2, (214, 160)), (3, (160, 120)), (3, (200, 150)), (4, (80, 60))])

@@ -459,7 +459,7 @@ def test_the_documented_topics_are_those_of_a_running_node(graph: Graph, tf_mess
     relative = {topic.name: topic.type_name for topic in interface.INPUTS if 'replaces' not in topic.help}
     expected_in = {resolved(name): type_name for name, type_name in relative.items() if name != 'odom'}
     expected_out = {f'/splatam/{output.topic}': output.type_name for output in OUTPUTS}
-    expected_out |= {resolved(topic.name): topic.type_name for topic in interface.OUTPUTS}
+    expected_out |= {resolved(topic.name): topic.type_name for topic in interface.SHARED_OUTPUTS}
     subscribed = on_graph(lambda: graph.node.get_subscriber_names_and_types_by_node('splatam', '/'))
     published = on_graph(lambda: graph.node.get_publisher_names_and_types_by_node('splatam', '/'))
     own = {'/rosout', '/parameter_events'}  # rclpy's

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,9 @@ from rclpy.parameter import Parameter
 
 from splatam_core.config import SlamConfig, load_config, settings
 from splatam_core.errors import ConfigError
+from splatam_core.settings import Setting
 from splatam_ros.node import parameters
+from splatam_ros.node.main import make_parser
 from splatam_ros.node.parameters import NODE_SETTINGS, NodeOptions
 from splatam_ros.node.reconfiguration import Reconfiguration
 
@@ -77,7 +80,20 @@ def test_every_setting_has_a_descriptor_with_help_and_bounds(make_node: MakeNode
         assert len(ranges) == (setting.minimum is not None or setting.maximum is not None)
         if setting.minimum is not None:
             assert ranges[0].from_value == setting.minimum
-        assert all(choice in descriptor.additional_constraints for choice in setting.choices)
+        assert all((choice or "''") in descriptor.additional_constraints for choice in setting.choices)
+
+
+def test_the_help_of_every_number_says_when_to_change_it() -> None:
+    numbers = [setting for setting in NODE_SETTINGS if setting.type in (int, float)]
+    assert [setting.name for setting in numbers if not re.search(r'[Ii]ncrease|[Dd]ecrease|Set ', setting.help)] == []
+
+
+def test_what_is_empty_is_shown_in_help_and_constraints() -> None:
+    empty = Setting('name', str, '', 'Help.', '', None, None, ('', 'one'))
+    assert (empty.shown_default, empty.shown_choices) == ('empty', "'', one")
+    with pytest.raises(ConfigError, match="name = 'two': expected one of '', one"):
+        empty.check('two')
+    assert '(, ' not in make_parser().format_help() and 'One of ,' not in make_parser().format_help()
 
 
 def test_a_parameter_file_for_all_nodes_is_read(make_node: MakeNode, tmp_path: Path) -> None:

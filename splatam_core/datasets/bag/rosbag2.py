@@ -147,7 +147,7 @@ class Rosbag2:
             names = ', '.join(file.name for file in stated if file not in there)
             self.notes.append(f'files that metadata.yaml names are missing: {names}')
         if not there:
-            missing = f'files are missing: {", ".join(metadata.file_names)}' if stated else metadata.problem or 'it names no files'
+            missing = f'files are missing: {", ".join(metadata.file_names)}' if stated else 'it holds no .db3 or .mcap file'
             raise DatasetError(f'{path}: cannot be read as a rosbag2: {missing}')
         return found or there
 
