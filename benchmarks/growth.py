@@ -53,7 +53,11 @@ def texture(along: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[
 
 def frame(index: int, cam: PinholeCamera, rng: np.random.Generator) -> RgbdFrame:
     """Renders the camera's view of the walls."""
-    T = pose(index)
+    return frame_at(pose(index), 10**9 + index * 33_333_333, cam, rng)
+
+
+def frame_at(T: NDArray[np.float64], stamp_ns: int, cam: PinholeCamera, rng: np.random.Generator) -> RgbdFrame:
+    """Renders the view of a camera at a pose [4, 4]."""
     u, v = np.meshgrid(np.arange(cam.width), np.arange(cam.height))
     rays = np.stack([(u - cam.cx) / cam.fx, (v - cam.cy) / cam.fy, np.ones(u.shape)], -1) @ T[:3, :3].T
     depth, colour = np.full(u.shape, np.inf), np.zeros((*u.shape, 3))
@@ -73,7 +77,7 @@ def frame(index: int, cam: PinholeCamera, rng: np.random.Generator) -> RgbdFrame
     depth += 0.0015 * depth**2 * rng.standard_normal(depth.shape)
     noisy = 255 * np.clip(colour, 0, 1) + rng.normal(0, 2, colour.shape)
     rgb = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
-    return RgbdFrame(10**9 + index * 33_333_333, rgb, np.maximum(depth, 0).astype(np.float32), cam)
+    return RgbdFrame(stamp_ns, rgb, np.maximum(depth, 0).astype(np.float32), cam)
 
 
 def main() -> None:

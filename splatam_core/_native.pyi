@@ -13,6 +13,7 @@ from splatam_core.geometry.camera import PinholeCamera
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
+Doubles = NDArray[np.float64]
 
 BLOCK: int
 """Gaussians per row of ``Gaussians.bounds``."""
@@ -137,6 +138,13 @@ class Aligner:
         inlier_color: float,
         inlier_depth: float,
     ) -> LinearSystem: ...
+
+def solve_blocks(place: NDArray[np.int32], blocks: Doubles, right_hand_side: Doubles) -> None:
+    """Solves a sparse symmetric system of 6x6 blocks; the solution [N, 6] replaces the right-hand side.
+
+    ``blocks`` [K, 6, 6] are those of the lower triangle, at row and column ``place`` [K, 2]; blocks at one place are added. A
+    matrix that is not positive definite is a ValueError.
+    """
 
 class TileLists:
     """What ``Blender.forward`` stores for ``Blender.backward``."""

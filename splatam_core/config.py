@@ -72,6 +72,29 @@ class PaperTrackingConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class RelocalisationConfig:
+    """How a camera that is lost is found again, wherever in the map it is."""
+
+    enabled: bool = setting(
+        False,
+        'Find a lost camera anywhere in the map, by the keyframes that show what it sees. Off: only near its last pose. Takes some '
+        'milliseconds and up to 60 kB for each keyframe.',
+    )
+    every: int = setting(
+        10,
+        'Once the camera is lost for more than 30 frames, look for it on every n-th frame only, and leave the others out. '
+        'Increase to save time while it is lost.',
+        unit='frames', minimum=1, maximum=MAX_FRAMES,
+    )  # fmt: skip
+    candidates: int = setting(
+        3,
+        'Number of places that a frame is aligned to, the most alike first. Increase when many places look alike, for more time '
+        'per frame while the camera is lost.',
+        minimum=1, maximum=100,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
 class AlignmentConfig:
     """Settings of direct alignment (``tracking.method: align``)."""
 
@@ -95,6 +118,7 @@ class AlignmentConfig:
         minimum=0,
         maximum=MAX_PX,
     )
+    relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +188,11 @@ class TrackingConfig:
     )
     paper: PaperTrackingConfig = field(default_factory=PaperTrackingConfig)
     align: AlignmentConfig = field(default_factory=AlignmentConfig)
+
+    @property
+    def relocalises(self) -> bool:
+        """Whether a lost camera is looked for anywhere in the map."""
+        return self.method == 'align' and self.align.relocalisation.enabled
 
 
 @dataclass(frozen=True, slots=True)
@@ -405,6 +434,29 @@ class MappingConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class GraphConfig:
+    """The keyframe graph, which corrects poses and map where the camera comes back to a place."""
+
+    enabled: bool = setting(
+        False,
+        'Keep a graph of the keyframes, recognise places seen before, and correct poses and map where they disagree. Needs a few '
+        'milliseconds per frame.',
+    )
+    loop_after: int = setting(
+        150, 'A place is looked for again when it was mapped at least this many frames ago. Decrease when the camera comes back '
+        'soon, increase to save time.',
+        unit='frames',
+        minimum=1, maximum=MAX_FRAMES,
+    )  # fmt: skip
+    min_correction_m: float = setting(
+        0.03,
+        'Correct poses and map only when a place is found again farther than this from where it should be, or turned by as many '
+        'radians: loops themselves err by one to three centimetres. Increase when corrections disturb the robot.',
+        unit='m', minimum=0.0, maximum=1e3,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
 class SlamConfig:
     """Every setting of SLAM. The defaults are the paper's for Replica."""
 
@@ -435,6 +487,7 @@ class SlamConfig:
     densification: DensificationConfig = field(default_factory=DensificationConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
+    graph: GraphConfig = field(default_factory=GraphConfig)
 
 
 SECTION_OF_METHOD = {

@@ -8,6 +8,7 @@ import numpy as np
 
 from splatam_core.config import TrackingConfig
 from splatam_core.geometry import se3
+from splatam_core.graph.keyframe_graph import KeyframeGraph
 from splatam_core.mapping.mapper import Mapper
 from splatam_core.tracking import Tracker
 from splatam_core.tracking.verdict import SAME_PLACE, verify
@@ -18,7 +19,7 @@ PROBATION = 15
 """Frames after which what a frame added counts as proven."""
 
 
-def correct(mapper: Mapper, tracker: Tracker, config: TrackingConfig, current: int) -> int:
+def correct(mapper: Mapper, graph: KeyframeGraph, tracker: Tracker, config: TrackingConfig, current: int) -> int:
     """Removes what was added at wrong poses, after the camera turned out to be elsewhere than those poses led to.
 
     The keyframes among the last frames are aligned once more, to the map without what these frames have added. From the first
@@ -26,6 +27,7 @@ def correct(mapper: Mapper, tracker: Tracker, config: TrackingConfig, current: i
 
     Args:
         mapper: holds map and keyframes.
+        graph: of the keyframes.
         tracker: aligns.
         config: says when an alignment counts.
         current: number of the present frame.
@@ -45,6 +47,7 @@ def correct(mapper: Mapper, tracker: Tracker, config: TrackingConfig, current: i
         off = np.linalg.norm(se3.log(found.T_cam_world @ se3.inverse(T_cam_world)).reshape(2, 3), axis=1).max()
         if not verify(found, config) and off > SAME_PLACE:
             removed = mapper.retract(right + 1)
+            graph.drop_from(right + 1)
             _log.warning(
                 'the pose of frame %d was wrong: what the frames from %d on have added, %d Gaussians, is removed',
                 keyframe.frame, right + 1, removed,

@@ -4,27 +4,36 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from splatam_core.config import SlamConfig
-from splatam_core.device import choose_backend, pose_tensor
-from splatam_core.errors import ConfigError, FrameError, SplatamError
+from splatam_core.device import HOST, choose_backend, pose_tensor
+from splatam_core.errors import ConfigError, FrameError, RasterizerError, SplatamError
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.graph.corrections import Corrections
+from splatam_core.graph.keyframe_graph import KeyframeGraph, TrackedFrame
+from splatam_core.graph.places import Places
+from splatam_core.graph.relocalisation import Relocaliser, RelocaliserState, Sight
 from splatam_core.images.observation import Observation
 from splatam_core.images.spacing import describe_spacing
+from splatam_core.images.view import View
 from splatam_core.interruption import Stop, never
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.mapper import Mapper
 from splatam_core.mapping.optimizers.base import TimeLimit
+from splatam_core.mapping.posed import PosedView
 from splatam_core.rasterizer import Gaussians, make_rasterizer
-from splatam_core.state import SlamState
+from splatam_core.state import NO_KEYFRAMES, SavedKeyframes, SlamState
 from splatam_core.stopwatch import Stopwatch
 from splatam_core.tracking import Tracker, TrackingResult, make_tracker
+from splatam_core.tracking.alignment import make_aligner
+from splatam_core.tracking.evidence import Evidence
 from splatam_core.tracking.motion import MotionModel, MotionPrior
 from splatam_core.tracking.verdict import Judge, Verdict
 from splatam_core.types import FrameResult, MapSnapshot, RenderedView, RgbdFrame, Status
@@ -41,15 +50,17 @@ class CurrentFrame:
         index: its number among those processed, from 0.
         frame: its images.
         clock: measures its stages.
+        T_world_odom: [4, 4] see ``FrameResult``.
     """
 
     index: int
     frame: RgbdFrame
     clock: Stopwatch
+    T_world_odom: Matrix
 
     def result(
         self, verdict: Verdict, T_world_cam: Matrix | None, slam: SlamLifecycle, *,
-        tracking: TrackingResult | None = None, is_keyframe: bool = False,
+        tracking: TrackingResult | None = None, is_keyframe: bool = False, is_relocalised: bool = False,
     ) -> FrameResult:  # fmt: skip
         """Returns the result of this frame."""
         is_first = verdict.status is Status.INITIALIZED
@@ -66,6 +77,8 @@ class CurrentFrame:
             timings=self.clock.timings(),
             covariance=verdict.covariance,
             num_held=verdict.num_held,
+            is_relocalised=is_relocalised,
+            T_world_odom=self.T_world_odom,
         )
 
 
@@ -76,6 +89,7 @@ class SlamLifecycle:
         config: every setting.
         backend: where SLAM is computed.
         camera: camera of the frames; None before the first.
+        graph: of the keyframes.
     """
 
     def __init__(
@@ -110,6 +124,8 @@ class SlamLifecycle:
         self._mapper = self._new_mapper()
         self._motion = self._new_motion_model()
         self._judge = Judge()
+        self._relocaliser = Relocaliser(Places())
+        self.graph = self._new_graph()
         self.camera: PinholeCamera | None = None
         self._num_frames = 0
         self._last_stamp_ns: int | None = None
@@ -118,6 +134,20 @@ class SlamLifecycle:
     def map(self) -> GaussianMap:
         """The Gaussians, on the backend's device."""
         return self._mapper.map
+
+    @property
+    def keyframes(self) -> Sequence[PosedView]:
+        """All keyframes, in the host's memory."""
+        return tuple(self._mapper.keyframes)
+
+    @property
+    def places(self) -> Places:
+        """The keyframes as places at which a lost camera is looked for."""
+        return self._relocaliser.places
+
+    @property
+    def _knows_places(self) -> bool:
+        return self.config.tracking.relocalises or self.graph.is_used
 
     @property
     def num_gaussians(self) -> int:
@@ -133,24 +163,40 @@ class SlamLifecycle:
         check_truth(config, self._true_motion)
         self.config = config
         self._mapper.configure(config)
+        self.graph.configure(config)
         self._tracker = self._new_tracker()
 
-    def load(self, gaussians: Gaussians, T_world_cam: Matrix) -> None:
+    def load(self, gaussians: Gaussians, T_world_cam: Matrix | None, saved: SavedKeyframes = NO_KEYFRAMES) -> None:
         """Continues in a map made earlier.
 
         Args:
             gaussians: the map.
-            T_world_cam: [4, 4] approximate pose of the camera in it.
+            T_world_cam: [4, 4] approximate pose of the camera in it; None = it is looked for by the keyframes.
+            saved: the keyframes of the map, with negative numbers.
 
         Raises:
-            ConfigError: as ``check_map``; nothing has changed.
+            ConfigError: as ``check_map``, or there is neither a pose nor a way to find it; nothing has changed.
         """
         self.check_map(gaussians)
+        if T_world_cam is None and not (saved.keyframes and self.config.tracking.relocalises):
+            raise ConfigError(
+                'the camera cannot be found in the map without keyframes and tracking.align.relocalisation.enabled: state its pose'
+            )
         mapper = self._new_mapper()
-        mapper.map.append(gaussians)
+        mapper.map.append(replace(gaussians, anchors=None))  # of frames of another run
+        for keyframe in saved.keyframes:
+            mapper.keyframes.append(keyframe)
         self.reset()
         self._mapper = mapper
-        self._motion.place(T_world_cam)
+        self._motion.place(np.eye(4) if T_world_cam is None else T_world_cam)
+        self._relocaliser.state = RelocaliserState(is_anywhere=T_world_cam is None)
+        if self._knows_places:
+            self.places.restore(saved.places)
+            self.places.follow(saved.keyframes)
+
+    def suggest(self, T_world_cam: Matrix) -> None:
+        """Tries a pose [4, 4] that a person gave, on the next frame; the log says if the camera is not there."""
+        self._relocaliser.tell(T_world_cam)
 
     def check_map(self, gaussians: Gaussians) -> None:
         """Checks that a map made earlier can be loaded.
@@ -169,9 +215,12 @@ class SlamLifecycle:
             config=self.config,
             camera=self.camera,
             map=self.map.arrays(),
-            keyframes=tuple(self._mapper.keyframes),
+            keyframes=tuple(self.keyframes),
             motion=self._motion.state(),
             judge=self._judge.state,
+            relocaliser=self._relocaliser.state,
+            places=self.places.arrays() if self._knows_places else {},
+            graph=self.graph.arrays(),
             rng=dict(self._mapper.rng.bit_generator.state),
             scene_radius=self._mapper.scene_radius,
             num_frames=self._num_frames,
@@ -188,13 +237,21 @@ class SlamLifecycle:
         self._mapper.restore(state.map, state.keyframes, state.rng, state.scene_radius)
         self._motion.restore(state.motion)
         self._judge.state = state.judge
+        self._relocaliser.state = state.relocaliser
+        self.graph.restore(state.graph)
+        if self._knows_places:
+            if state.places:
+                self.places.restore(state.places)
+            self.places.follow(self._mapper.keyframes)
         self.camera = state.camera
         self._num_frames, self._last_stamp_ns = state.num_frames, state.last_stamp_ns
 
     def rest(self) -> None:
         """Assumes that the camera is at its last pose, at rest; the next frame may have any stamp."""
         self._motion.place(self._motion.last_pose)
+        self._relocaliser.interrupt()
         self._last_stamp_ns = None
+        self.graph.rest()
 
     def render(self, T_world_cam: Matrix) -> RenderedView:
         """Renders the map from a pose [4, 4], through the camera of the frames.
@@ -209,7 +266,9 @@ class SlamLifecycle:
             return self._rasterizer.render(self.map.gaussians.detached(), self.camera, T_cam_world).images()
 
     def finish(self, limit_s: float = math.inf, stop: Stop = never) -> int:
-        """Fits the map to all keyframes once more, after the last frame (``mapping.fused.final_passes``).
+        """Makes poses and map agree with all that the graph has measured, then fits the map to all keyframes once more.
+
+        Both after the last frame (``graph.enabled``, ``mapping.fused.final_passes``).
 
         Args:
             limit_s: longest time, seconds.
@@ -218,7 +277,34 @@ class SlamLifecycle:
         Returns:
             The number of steps taken.
         """
+        self.optimize_graph()
         return self._mapper.finish(TimeLimit(limit_s, stop))
+
+    def optimize_graph(self) -> float:
+        """Corrects poses and map so that they agree best with all that the graph has measured.
+
+        Returns:
+            The largest distance, in metres, by which a keyframe was moved.
+        """
+        before = self.graph.nodes.T_world_cam
+        self._correct(self.graph.settle())
+        return float(np.linalg.norm(self.graph.nodes.T_world_cam[:, :3, 3] - before[:, :3, 3], axis=1).max(initial=0.0))
+
+    def _follow_graph(
+        self, current: CurrentFrame, T_world_cam: Matrix, evidence: Evidence | None = None, *, is_found: bool = False
+    ) -> None:
+        """Tells the graph of a tracked frame; corrects map, keyframes and the poses from which tracking goes on, if it says so."""
+        if not self.graph.is_used or not len(self._mapper.keyframes):
+            return
+        covariance = np.zeros((6, 6)) if evidence is None else evidence.covariance
+        frame = TrackedFrame(current.index, current.frame.stamp_ns, T_world_cam, covariance, is_found)
+        self._correct(self.graph.follow(frame, self._mapper.keyframes, self.places))
+
+    def _correct(self, corrections: Corrections | None) -> None:
+        if corrections is not None:
+            self._mapper.correct(corrections.at)
+            self._motion.correct(corrections.motions[-1])
+            self.places.follow(self._mapper.keyframes)
 
     def snapshot(self) -> MapSnapshot:
         """Returns a copy of the map."""
@@ -235,7 +321,7 @@ class SlamLifecycle:
             )
         self.camera = frame.camera
         index, self._num_frames, self._last_stamp_ns = self._num_frames, self._num_frames + 1, frame.stamp_ns
-        return CurrentFrame(index, frame, Stopwatch(self.backend.device))
+        return CurrentFrame(index, frame, Stopwatch(self.backend.device), self.graph.T_world_odom)
 
     def _observe(self, frame: RgbdFrame) -> Observation:
         """Returns the frame's images; says once that the depth has a grid of holes."""
@@ -246,8 +332,36 @@ class SlamLifecycle:
             self._told_spacing = True
         return seen
 
+    def _sight(self, seen: Observation, view: View, stamp_ns: int) -> Sight:
+        """Returns what is needed to look for a frame anywhere in the map. view: as it is tracked."""
+        return Sight(
+            stamp_ns=stamp_ns,
+            view=view,
+            host=seen.host,
+            gaussians=self.map.gaussians,
+            tracker=self._tracker,
+            time_offset=self._motion.time_offset,
+            config=self.config.tracking,
+        )
+
+    def _note_place(self, seen: Observation, index: int) -> None:
+        """Makes the keyframes the places that are recognised. seen: the frame that has just been mapped."""
+        if self._knows_places:
+            if self.keyframes and self.keyframes[-1].frame == index:
+                self.places.add(index, seen.host, self._motion.last_pose)
+            self.places.follow(self._mapper.keyframes)
+
     def _new_mapper(self) -> Mapper:
         return Mapper(self.config, self._rasterizer, self.backend.device, self._recording_length, self._stop)
+
+    def _new_graph(self) -> KeyframeGraph:
+        aligner = None
+        if self.config.graph.enabled:
+            try:
+                aligner = make_aligner(self.config.threads, HOST)  # keyframes are there
+            except RasterizerError as error:
+                _log.warning('there is no keyframe graph, as if graph.enabled were false: %s', error)
+        return KeyframeGraph(self.config, aligner)
 
     def _new_tracker(self) -> Tracker:
         return make_tracker(self._rasterizer, self.config.tracking, self.config.threads, self.backend.device, self._stop)

@@ -6,6 +6,7 @@ import numpy as np
 
 from splatam_core.correction import correct
 from splatam_core.geometry import se3
+from splatam_core.graph.relocalisation import unknown
 from splatam_core.images.observation import Observation
 from splatam_core.images.view import View
 from splatam_core.lifecycle import CurrentFrame, SlamLifecycle
@@ -28,12 +29,18 @@ class Slam(SlamLifecycle):
             FrameError: the frame has another camera than the first one, or is not later than the last one.
         """
         current = self._admit(frame)
+        if self._relocaliser.is_resting(self.config.tracking):
+            return current.result(self._relocaliser.rest(), None, self)
         seen = self._observe(frame)
         if self.num_gaussians == 0:
             return self._initialize(current, seen)
 
-        predictions = self._motion.predictions(frame.stamp_ns)
-        tracked, verdict = self._find(seen.device.scaled(self.config.tracking.scale), predictions)
+        view = seen.device.scaled(self.config.tracking.scale)
+        tracked, verdict = self._find(view, self._motion.predictions(frame.stamp_ns))
+        found = self._relocaliser.recover(self._sight(seen, view, frame.stamp_ns), tracked, verdict)
+        if found is not None:
+            tracked, verdict = found.result, self._judge.relocate(found.judge, found.verdict)
+            self._motion.place(found.T_world_cam)
         current.clock.lap('track')
         if verdict.status is Status.LOST:
             self._motion.stop()
@@ -46,7 +53,7 @@ class Slam(SlamLifecycle):
             return current.result(verdict, T_world_cam, self, tracking=tracked)
         self._motion.time_offset = tracked.time_offset
         if verdict.corrects:
-            correct(self._mapper, self._tracker, self.config.tracking, current.index)
+            correct(self._mapper, self.graph, self._tracker, self.config.tracking, current.index)
         posed = PosedFrame(seen, tracked.T_cam_world, self.config.mapping, current.index)
         plan = self._mapper.schedule.plan(current.index, tracked.visible_fraction)
         self._mapper.densify(posed, plan)
@@ -55,10 +62,18 @@ class Slam(SlamLifecycle):
         current.clock.lap('keyframes')
         self._mapper.optimize(window, plan)
         current.clock.lap('map')
-        return current.result(verdict, T_world_cam, self, tracking=tracked, is_keyframe=plan.is_keyframe)
+        if plan.is_keyframe or verdict.corrects:
+            self._note_place(seen, current.index)
+        self._follow_graph(current, T_world_cam, tracked.evidence, is_found=found is not None)
+        current.clock.lap('graph')
+        return current.result(
+            verdict, T_world_cam, self, tracking=tracked, is_keyframe=plan.is_keyframe, is_relocalised=found is not None
+        )
 
     def _find(self, view: View, predictions: list[Prediction]) -> tuple[TrackingResult, Verdict]:
         """Finds the pose of a view: from the last pose, and where that is uncertain, also from the last one to be trusted."""
+        if self._relocaliser.state.is_anywhere:
+            return unknown()
         found = [
             self._tracker.track(
                 view, self.map.gaussians, predicted.T_cam_world, se3.inverse(predicted.T_world_cam_before), self._motion.time_offset
@@ -90,4 +105,6 @@ class Slam(SlamLifecycle):
         if reason:
             return current.result(Verdict(Status.LOST, f'the map cannot start: {reason}'), None, self)
         self._motion.observe(current.frame.stamp_ns, np.eye(4))
+        self._note_place(seen, current.index)
+        self._follow_graph(current, np.eye(4))
         return current.result(self._judge.start(), np.eye(4), self, is_keyframe=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
@@ -60,6 +60,7 @@ class StageTimings:
     densify: float = 0.0
     keyframes: float = 0.0
     map: float = 0.0
+    graph: float = 0.0
     total: float = 0.0
 
 
@@ -103,6 +104,8 @@ class FrameResult:
         timings: wall time of each stage.
         covariance: of the pose; None if the frame is lost or the tracker estimates none.
         num_held: number of directions (of six) that the images did not determine, in which the pose is the predicted one.
+        is_relocalised: True if the camera was found anew in the map: its pose does not follow from the frame before.
+        T_world_odom: [4, 4] all corrections of the world before this frame: its pose is this times one that never jumps.
     """
 
     index: int
@@ -117,6 +120,25 @@ class FrameResult:
     timings: StageTimings
     covariance: PoseCovariance | None = None
     num_held: int = 0
+    is_relocalised: bool = False
+    T_world_odom: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+
+
+@dataclass(frozen=True, slots=True)
+class GraphSummary:
+    """What a keyframe graph holds.
+
+    Attributes:
+        nodes: number of keyframes.
+        loops: number of places that were recognised.
+        corrections: number of times that poses and map were corrected.
+        last_correction_m: distance by which the last of them moved the newest pose; 0 before the first.
+    """
+
+    nodes: int = 0
+    loops: int = 0
+    corrections: int = 0
+    last_correction_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -49,6 +49,9 @@ INPUTS = (
           'replaces `depth/image` with `depth_transport: compressedDepth`'),
     Topic('rgb/camera_info', 'sensor_msgs/msg/CameraInfo', 'calibration of the colour camera'),
     Topic('odom', 'nav_msgs/msg/Odometry', 'odometry from which tracking starts, with `odom.source: topic`'),
+    Topic('initialpose', 'geometry_msgs/msg/PoseWithCovarianceStamped',
+          "where the robot is in `map_frame`, told by a person (RViz's 2D Pose Estimate); without a base, where the camera is and "
+          'looks to'),
     Topic('/tf_static', 'tf2_msgs/msg/TFMessage', 'pose of the camera in the base; which frames already have a parent'),
     Topic('/tf', 'tf2_msgs/msg/TFMessage', 'odometry from which tracking starts, with `odom.source: tf`'),
 )  # fmt: skip

@@ -25,7 +25,7 @@ OPTIONAL = {
 }
 MESSAGES = {
     'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'rcl_interfaces', 'rosgraph_msgs',
-    'sensor_msgs', 'std_msgs', 'std_srvs', 'tf2_msgs',
+    'sensor_msgs', 'std_msgs', 'std_srvs', 'tf2_msgs', 'visualization_msgs',
 }  # fmt: skip
 MAY_IMPORT = {
     'msg_adapters': {'cv2', 'msg_adapters', 'numpy'},
@@ -51,6 +51,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ('splatam_core._native',),
     ('splatam_core.rasterizer',),
     ('splatam_core.tracking', 'splatam_core.mapping'),
+    ('splatam_core.graph',),
     ('splatam_core.state',),
     ('splatam_core.lifecycle',),
     ('splatam_core.correction',),

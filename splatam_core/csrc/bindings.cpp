@@ -9,6 +9,7 @@
 #include "aligner.hpp"
 #include "arrays.hpp"
 #include "blender_bindings.hpp"
+#include "block_cholesky.hpp"
 #include "engine.hpp"
 
 namespace py = pybind11;
@@ -235,6 +236,25 @@ Array layers(Aligner& aligner, const py::object& brightness, const py::object& d
   return result;
 }
 
+void solve_in_place(const py::object& place, const py::object& blocks, const py::object& right_hand_side) {
+  const py::ssize_t size = length_of(right_hand_side, "right_hand_side"), count = length_of(place, "place");
+  const BlockMatrix matrix{std::size_t(size), std::size_t(count), values<std::int32_t>(place, "place", {count, 2}),
+                           values<double>(blocks, "blocks", {count, kPoseSize, kPoseSize})};
+  double* x = written<double>(right_hand_side, "right_hand_side", {size, kPoseSize});
+  for (py::ssize_t k = 0; k < count; ++k) {
+    const std::int32_t row = matrix.place[2 * k], column = matrix.place[2 * k + 1];
+    if (column < 0 || row < column || row >= size)
+      throw py::value_error("place[" + std::to_string(k) + "] is (" + std::to_string(row) + ", " +
+                            std::to_string(column) + "); expected a block of the lower triangle");
+  }
+  bool is_solved = false;
+  {
+    py::gil_scoped_release release;
+    is_solved = solve_blocks(matrix, x);
+  }
+  if (!is_solved) throw py::value_error("the matrix is not positive definite");
+}
+
 void bind_engine(py::module_& module) {
   py::class_<View, std::shared_ptr<View>>(module, "View");
   py::class_<Engine, std::shared_ptr<Engine>>(module, "Engine")
@@ -287,4 +307,5 @@ PYBIND11_MODULE(_native, module) {
   bind_engine(module);
   bind_aligner(module);
   bind_blender(module);
+  module.def("solve_blocks", &solve_in_place, py::arg("place"), py::arg("blocks"), py::arg("right_hand_side"));
 }

@@ -165,6 +165,26 @@ def _image_bytes(path: Path) -> bytes:
     return data
 
 
+def decoded(data: NDArray[np.uint8], size: tuple[int, int], flags: int) -> NDArray[Any]:
+    """Returns the image in the bytes of a file.
+
+    Args:
+        data: [N] the bytes.
+        size: width and height that the image must have; another one is not decoded.
+        flags: OpenCV's, how to decode it.
+
+    Raises:
+        ValueError: the bytes are no such image.
+    """
+    stated = stated_size(data.tobytes())
+    if stated != size or is_cut(data.tobytes()):
+        raise ValueError(f'an image of {stated}; expected {size}')
+    image = cv2.imdecode(data, flags)
+    if image is None:
+        raise ValueError(f'an image of {len(data)} bytes that cannot be decoded')
+    return image
+
+
 def _read_image(path: Path, flags: int) -> NDArray[Any]:
     data = _image_bytes(path)
     try:

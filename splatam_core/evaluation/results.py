@@ -26,6 +26,7 @@ class TrajectoryEvaluation:
         per_frame: the relative pose error from frame to frame.
         per_second: the relative pose error over one second.
         splatam_ate_mean_m: the number that the original prints as "ATE RMSE".
+        final: the absolute trajectory error after all corrections of the keyframe graph; None where it was not saved.
         ground_truth: the whole ground truth, aligned to the run's world.
     """
 
@@ -34,6 +35,7 @@ class TrajectoryEvaluation:
     per_frame: RelativePoseError
     per_second: RelativePoseError
     splatam_ate_mean_m: float
+    final: TrajectoryError | None
     ground_truth: Trajectory
 
 
@@ -138,6 +140,7 @@ def _with_trajectory(metrics: Metrics, trajectory: TrajectoryEvaluation, run: Ru
     return replace(
         metrics,
         ate_rmse_m=trajectory.error.rmse_m,
+        ate_final_rmse_m=None if trajectory.final is None else trajectory.final.rmse_m,
         ate_frames=len(trajectory.error.stamps_ns),
         ate_tracked_rmse_m=None if tracked is None else tracked.rmse_m,
         worst_error_m=None if tracked is None else float(tracked.errors_m.max()),

@@ -50,6 +50,7 @@ def score_trajectory(run: RunRecord, ground_truth: Trajectory) -> TrajectoryEval
         per_frame=per_frame,
         per_second=per_second,
         splatam_ate_mean_m=splatam_ate_mean_m(run.trajectory, ground_truth),
+        final=None if run.final is None else trajectory_error(run.final, ground_truth),
         ground_truth=transformed(ground_truth, error.T_estimate_ground_truth),
     )
 
@@ -157,11 +158,12 @@ def score_novel_views(run: RunRecord, ground_truth: Trajectory, test: Sequence, 
 
 
 def _T_map_ground_truth(run: RunRecord, ground_truth: Trajectory, alignment: str) -> Pose:
-    poses, known = interpolate_poses(ground_truth, run.trajectory.stamps_ns)
+    trajectory = run.in_final_map()
+    poses, known = interpolate_poses(ground_truth, trajectory.stamps_ns)
     if not known.any():
-        raise RunFolderError(f'none of the {len(run.trajectory)} frames with a pose has ground truth at its stamp')
+        raise RunFolderError(f'none of the {len(trajectory)} frames with a pose has ground truth at its stamp')
     count = None if alignment == 'trajectory' else 1
-    return align_poses(poses[known][:count], run.trajectory.T_world_cam[known][:count])
+    return align_poses(poses[known][:count], trajectory.T_world_cam[known][:count])
 
 
 def make_scorer(run: RunRecord, lpips: Lpips | str) -> ViewScorer:

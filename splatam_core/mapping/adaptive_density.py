@@ -7,6 +7,7 @@ constants of SplaTAM's offline scripts. The gradient is that of the whole loss, 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -80,4 +81,4 @@ def _scattered(g: Gaussians, rng: np.random.Generator) -> Gaussians:
     if g.rotations is not None:
         R = torch.from_numpy(se3.rotation_from_quaternion(g.rotations.double().numpy(force=True))).float().to(device)
         offsets = (R @ offsets[:, :, None])[:, :, 0]
-    return Gaussians(g.means + offsets, g.log_scales - math.log(SHRINK), g.logit_opacities, g.rgb, None, g.rotations)
+    return replace(g, means=g.means + offsets, log_scales=g.log_scales - math.log(SHRINK), bounds=None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -77,7 +77,8 @@ class GaussianMap:
     def gaussians(self) -> Gaussians:
         """The parameters themselves, not a copy; they carry gradients during an optimization."""
         bounds = self._bounds if self._optimizer is None else None
-        return Gaussians(self.means, self.log_scales, self.logit_opacities, self.rgb, bounds, self.rotations)
+        values = self.means, self.log_scales, self.logit_opacities, self.rgb
+        return Gaussians(*values, bounds=bounds, rotations=self.rotations, anchors=self.added_by)
 
     @property
     def moments(self) -> Moments:
@@ -86,11 +87,11 @@ class GaussianMap:
 
     @property
     def added_by(self) -> Tensor:
-        """[N] number of the frame that added each Gaussian; 0 for those of a map that was loaded."""
+        """[N] number of the frame that added each Gaussian, its anchor; 0 for those of a map that was loaded."""
         return self._storage[ADDED_BY][: self._size]
 
     def append(self, new: Gaussians) -> Tensor:
-        """Adds Gaussians, but none that is not ``usable``. Ends an optimization in progress.
+        """Adds Gaussians, but none that is not ``usable``. Ends an optimization in progress. They keep their anchors.
 
         Returns:
             [K] which of the new Gaussians were added.
@@ -108,7 +109,7 @@ class GaussianMap:
         self._reserve()
         for name in ('first_second', 'steps'):
             self._storage[name][old_size : self._size] = 0
-        self._storage[ADDED_BY][old_size : self._size] = self.frame
+        self._storage[ADDED_BY][old_size : self._size] = self.frame if new.anchors is None else new.anchors
         self._refresh_views()
         self._put(new, old_size)
         return added
@@ -158,6 +159,36 @@ class GaussianMap:
                 new = getattr(self, name).requires_grad_()
                 new.grad = None if old[name].grad is None else old[name].grad.index_select(0, kept)
                 _replace_parameter(self._optimizer, old[name], new, kept)
+
+    def move(self, motion_of: Callable[[NDArray[np.int64]], NDArray[np.float64]]) -> int:
+        """Moves each Gaussian with the frame that added it. What moves loses its moments, which were of its old place.
+
+        Args:
+            motion_of: returns the motions [K, 4, 4] in the world of frames [K].
+
+        Returns:
+            The number of Gaussians that moved.
+        """
+        assert self._optimizer is None
+        anchors = self.added_by.long()
+        frames = torch.nonzero(torch.bincount(anchors))[:, 0]
+        if not len(frames):
+            return 0
+        motions = torch.from_numpy(motion_of(frames.numpy(force=True)).astype(np.float32)).to(anchors.device)
+        row = anchors.new_zeros(int(frames[-1]) + 1)
+        row[frames] = torch.arange(len(frames), device=row.device)
+        moves = (motions != torch.eye(4, device=row.device)).any(dim=2).any(dim=1)
+        moved = torch.nonzero(moves[row[anchors]])[:, 0]
+        motion = motions[row[anchors[moved]]]
+        x, y, z = self.means[moved].unbind(dim=1)
+        columns = motion[:, :3].unbind(dim=2)
+        self.means[moved] = columns[0] * x[:, None] + columns[1] * y[:, None] + columns[2] * z[:, None] + columns[3]
+        if self.rotations is not None:
+            self.rotations[moved] = _turned(motion[:, :3, :3], self.rotations[moved])
+        for name in ('first_second', 'steps'):
+            self._storage[name][: self._size][moved] = 0
+        self._update_bounds(0)
+        return len(moved)
 
     def start_optimization(self, rates: Rates) -> None:
         """Begins an optimization with fresh moments, as the paper does for every frame."""
@@ -280,6 +311,23 @@ class GaussianMap:
 
 def _host_copy(values: Tensor) -> NDArray[Any]:
     return values.detach().to('cpu', copy=True).numpy()
+
+
+def _turned(turns: Tensor, quaternions: Tensor) -> Tensor:
+    """Returns [K, 4] quaternions after turns [K, 3, 3] of less than half a circle."""
+    w = 0.5 * (1 + turns.diagonal(dim1=1, dim2=2).sum(dim=1)).clamp(min=1e-6).sqrt()
+    skew = turns - turns.mT
+    x, y, z = (torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]]) / (4 * w)).unbind()
+    a, b, c, d = quaternions.unbind(dim=1)
+    return torch.stack(
+        [
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ],
+        dim=1,
+    )
 
 
 def _padded(value: Tensor, count: int) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,14 @@ class KeyframeStore(Sequence[PosedView]):
         for keyframe in [keyframe for keyframe in self._kept if keyframe.frame >= frame]:
             self._kept.remove(keyframe)
             self._copies.pop(keyframe, None)
+
+    def place(self, T_cam_world: Sequence[Tensor]) -> None:
+        """Moves all keyframes to other poses [4, 4] float32, one each."""
+        moved = {old: replace(old, T_cam_world=T) for old, T in zip(self._kept, T_cam_world, strict=True)}
+        self._copies = {
+            moved[old]: replace(copy, T_cam_world=moved[old].T_cam_world.to(self._device)) for old, copy in self._copies.items()
+        }
+        self._kept = list(moved.values())
 
     def on_device(self, keyframe: PosedView) -> PosedView:
         """Returns a keyframe on the device; copies it there if necessary."""

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import takewhile
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from splatam_core.config import SlamConfig
+from splatam_core.geometry import se3
 from splatam_core.images.view import View, narrowing
 from splatam_core.interruption import Stop, never
 from splatam_core.mapping.densification import densify
@@ -124,6 +126,18 @@ class Mapper:
         if removed:
             self.map.keep(added_before)
         return removed
+
+    def correct(self, motion_of: Callable[[NDArray[np.int64]], NDArray[np.float64]]) -> None:
+        """Moves Gaussians and keyframes together.
+
+        Args:
+            motion_of: returns the motions [K, 4, 4] in the world of frames [K].
+        """
+        self.map.move(motion_of)
+        frames = np.array([keyframe.frame for keyframe in self.keyframes], dtype=np.int64)
+        T_cam_world = [keyframe.T_cam_world.double().numpy(force=True) for keyframe in self.keyframes]
+        moved = np.array(T_cam_world).reshape(-1, 4, 4) @ se3.inverse(motion_of(frames))
+        self.keyframes.place([torch.from_numpy(T.astype(np.float32)) for T in moved])
 
     def finish(self, limit: TimeLimit) -> int:
         """Fits the map to all keyframes once more, after the last frame. Returns the number of steps."""

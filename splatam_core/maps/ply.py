@@ -2,7 +2,8 @@
 
 Each Gaussian is one ``vertex`` element of little-endian floats: centre, unused normals, colour as the zeroth
 spherical-harmonics coefficient ``f_dc = (rgb - 0.5) / C0``, logit opacity, three log scales in log metres and a
-quaternion w x y z. An isotropic Gaussian repeats its scale and has the identity rotation.
+quaternion w x y z. An isotropic Gaussian repeats its scale and has the identity rotation. A last property, an integer that viewers
+ignore, is the number of the frame that added the Gaussian, where that is known.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ NORMALS = ('nx', 'ny', 'nz')
 F_DC = ('f_dc_0', 'f_dc_1', 'f_dc_2')
 SCALES = ('scale_0', 'scale_1', 'scale_2')
 RGB = ('red', 'green', 'blue')
+ANCHOR = 'anchor'
 ROTATION = ('rot_0', 'rot_1', 'rot_2', 'rot_3')
 
 ALIASES = {
@@ -82,13 +84,17 @@ def write_ply(path: Path, gaussians: Gaussians, *, sh_degree: int = 0) -> None:
     """
     check_usable(path, gaussians)
     columns = _columns(gaussians)
-    names = properties(sh_degree)
-    rows = np.zeros(len(gaussians), dtype=[(name, '<f4') for name in names])
+    names, anchors = properties(sh_degree), gaussians.anchors
+    more = [] if anchors is None else [(ANCHOR, '<i4')]
+    rows = np.zeros(len(gaussians), dtype=[*((name, '<f4') for name in names), *more])
     for name, column in columns.items():
         rows[name] = column
+    if anchors is not None:
+        rows[ANCHOR] = anchors.numpy(force=True)
     header = [
         'ply', 'format binary_little_endian 1.0', *(f'comment {line}' for line in COMMENTS),
-        f'element vertex {len(rows)}', *(f'property float {name}' for name in names), 'end_header', '',
+        f'element vertex {len(rows)}', *(f'property float {name}' for name in names),
+        *(f'property int {name}' for name, _ in more), 'end_header', '',
     ]  # fmt: skip
     with replaced(path) as temporary, temporary.open('wb') as file:
         file.write('\n'.join(header).encode('ascii'))
@@ -188,6 +194,7 @@ def read_ply(path: Path) -> Gaussians:
         logit_opacities=torch.from_numpy(values['opacity']),
         rgb=_tensor(values, F_DC) * SH_C0 + 0.5 if F_DC[0] in values else _tensor(values, RGB) / 255,
         rotations=_tensor(values, ROTATION) if is_anisotropic else None,
+        anchors=_anchors(path, rows),
     )
 
 
@@ -239,6 +246,22 @@ def _check_rotations(path: Path, values: dict[str, NDArray[np.float32]]) -> None
     is_zero = ~(np.linalg.norm([values[name] for name in ROTATION], axis=0) > MIN_QUATERNION)
     if is_zero.any():
         raise MapFileError(f'{path}: {int(is_zero.sum())} of {len(is_zero)} Gaussians have a quaternion of length zero')
+
+
+def _anchors(path: Path, rows: NDArray[np.void]) -> torch.Tensor | None:
+    """Returns [N] the frames that added the Gaussians; None where the file has no such property.
+
+    Raises:
+        MapFileError: they are no numbers of frames.
+    """
+    if ANCHOR not in (rows.dtype.names or ()):
+        return None
+    anchors = rows[ANCHOR]
+    if not np.issubdtype(anchors.dtype, np.integer):
+        return None  # of another program
+    if len(anchors) and not (anchors.min() >= 0 and anchors.max() < 2**31):
+        raise MapFileError(f'{path}: property {ANCHOR} holds {anchors.min()} to {anchors.max()}: expected numbers of frames')
+    return torch.from_numpy(anchors.astype(np.int32))
 
 
 def _tensor(values: dict[str, NDArray[np.float32]], names: tuple[str, ...]) -> torch.Tensor:

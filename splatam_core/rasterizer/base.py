@@ -18,7 +18,7 @@ A Gaussian with a value that is not finite, or beyond 1e30, is not drawn and doe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -60,6 +60,7 @@ class Gaussians:
         bounds: [ceil(N / BLOCK), 7] smallest mean, largest mean and largest log scale of each run of BLOCK Gaussians, by which
             a rasterizer may skip what is out of view; None if not computed.
         rotations: [N, 4] quaternions (w, x, y, z) of any non-zero length, axes to world; None: the Gaussians are isotropic.
+        anchors: [N] int32 number of the frame that added each, with which it moves when poses are corrected; None if not known.
     """
 
     means: Tensor
@@ -68,6 +69,7 @@ class Gaussians:
     rgb: Tensor
     bounds: Tensor | None = None
     rotations: Tensor | None = None
+    anchors: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.means)
@@ -81,6 +83,7 @@ class Gaussians:
             rgb=self.rgb.detach(),
             bounds=self.bounds,
             rotations=None if self.rotations is None else self.rotations.detach(),
+            anchors=self.anchors,
         )
 
     def to(self, device: torch.device) -> Gaussians:
@@ -92,6 +95,7 @@ class Gaussians:
             rgb=self.rgb.to(device),
             bounds=None if self.bounds is None else self.bounds.to(device),
             rotations=None if self.rotations is None else self.rotations.to(device),
+            anchors=None if self.anchors is None else self.anchors.to(device),
         )
 
     def usable(self) -> Tensor:
@@ -112,9 +116,9 @@ class Gaussians:
     def chosen(self, which: Tensor) -> Gaussians:
         """Returns the Gaussians of a mask [N], without bounds."""
         rotations = None if self.rotations is None else self.rotations[which]
-        return Gaussians(
-            self.means[which], self.log_scales[which], self.logit_opacities[which], self.rgb[which], rotations=rotations
-        )
+        anchors = None if self.anchors is None else self.anchors[which]
+        values = self.means[which], self.log_scales[which], self.logit_opacities[which], self.rgb[which]
+        return Gaussians(*values, rotations=rotations, anchors=anchors)
 
     def anisotropic(self) -> Gaussians:
         """Returns them as anisotropic Gaussians: isotropic ones get three equal radii and the identity rotation."""
@@ -122,7 +126,7 @@ class Gaussians:
             return self
         rotations = self.means.new_zeros(len(self), 4)
         rotations[:, 0] = 1.0
-        return Gaussians(self.means, self.log_scales.repeat(1, 3), self.logit_opacities, self.rgb, self.bounds, rotations)
+        return replace(self, log_scales=self.log_scales.repeat(1, 3), rotations=rotations)
 
 
 def check_isotropic(gaussians: Gaussians) -> None:
@@ -139,11 +143,16 @@ def check_isotropic(gaussians: Gaussians) -> None:
 
 
 def joined(first: Gaussians, second: Gaussians) -> Gaussians:
-    """Returns the Gaussians of both, the first's first, with bounds if the first has them. Anisotropic if one of them is."""
+    """Returns the Gaussians of both, the first's first, with bounds if the first has them. Anisotropic if one of them is.
+
+    Their anchors are known if those of both are.
+    """
     if first.rotations is not None or second.rotations is not None:
         first, second = first.anisotropic(), second.anisotropic()
     names = 'means', 'log_scales', 'logit_opacities', 'rgb', 'rotations'
     values = {name: torch.cat([getattr(first, name), getattr(second, name)]) for name in names if getattr(first, name) is not None}
+    if first.anchors is not None and second.anchors is not None:
+        values['anchors'] = torch.cat([first.anchors, second.anchors])
     bounds = first.bounds
     if bounds is not None and len(second):
         full = len(first) // BLOCK

@@ -8,6 +8,9 @@ from contextlib import contextmanager
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from splatam_core.errors import RasterizerError
 from splatam_core.rasterizer.bounds import BLOCK
 
@@ -33,6 +36,21 @@ def make_blender(threads: int) -> _native.Blender:
 def make_native_aligner(threads: int) -> _native.Aligner:
     """Returns what aligns frames on the CPU; see ``make_engine``."""
     return _made('Aligner', threads)
+
+
+def solve_blocks(place: NDArray[np.int32], blocks: NDArray[np.float64], right_hand_side: NDArray[np.float64]) -> None:
+    """Solves a sparse symmetric system of 6x6 blocks in place.
+
+    Args:
+        place: [K, 2] row and column of the blocks of the lower triangle; those at one place are added.
+        blocks: [K, 6, 6].
+        right_hand_side: [N, 6]; the solution replaces it.
+
+    Raises:
+        RasterizerError: the extension is missing.
+        ValueError: the matrix is not positive definite.
+    """
+    _extension().solve_blocks(place, blocks, right_hand_side)
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from splatam_core.atomic_io import is_unfinished
 from splatam_core.config import SlamConfig, flat_values, with_values
 from splatam_core.errors import CheckpointError, one_line
 from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.graph.relocalisation import Recognition, RelocaliserState
 from splatam_core.images.view import View
 from splatam_core.mapping.posed import PosedView
 from splatam_core.retired_settings import migrated
@@ -39,8 +40,10 @@ from splatam_core.types import Arrays
 
 VERSION = 1
 KIND, KEYFRAME = 'checkpoint', 'keyframe'
-_MAP = 'map.'
+_MAP, _PLACES, _GRAPH = 'map.', 'places.', 'graph.'
+_KEYFRAME_POSES = 'keyframe_poses'
 _JUDGE = tuple(entry.name for entry in fields(JudgeState) if entry.name != 'covariance')
+_RELOCALISER = {'told': (4, 4), 'recognised_T_world_cam': (4, 4), 'recognised_covariance': (6, 6)}
 _MOTION_SHAPES = {'T_world_cam': (4, 4), 'velocity': (6,), 'T_world_cam_trusted': (4, 4), 'pose_covariance': (6, 6)}
 
 
@@ -88,7 +91,7 @@ class Checkpoints:
         """
         self._folder = folder
         self._keep = keep
-        self._written: dict[PosedView, str] = {}
+        self._written: dict[View, str] = {}
         self._needed: dict[Path, frozenset[str]] = {}
 
     def save(self, state: SlamState, progress: Progress) -> Path:
@@ -98,7 +101,7 @@ class Checkpoints:
             OSError: it cannot be written; the existing checkpoints stay.
         """
         (self._folder / KEYFRAMES).mkdir(parents=True, exist_ok=True)
-        self._written = {keyframe: self._write_keyframe(keyframe) for keyframe in state.keyframes}
+        self._written = {keyframe.view: self._write_keyframe(keyframe) for keyframe in state.keyframes}
         digests = tuple(self._written.values())
         path = self._folder / f'{progress.num_lines:06d}.{KIND}'
         pack(KIND, VERSION, _to_content(state, progress, digests)).write(path)
@@ -107,8 +110,8 @@ class Checkpoints:
         return path
 
     def _write_keyframe(self, keyframe: PosedView) -> str:
-        if keyframe in self._written:
-            return self._written[keyframe]
+        if keyframe.view in self._written:  # its pose may have moved: the checkpoint has that
+            return self._written[keyframe.view]
         arrays = {
             'rgb8': keyframe.view.rgb8.numpy(force=True), 'depth': keyframe.view.depth.numpy(force=True),
             'T_cam_world': keyframe.T_cam_world.numpy(force=True),
@@ -188,9 +191,49 @@ def _to_content(state: SlamState, progress: Progress, digests: Sequence[str]) ->
         'trusted_ns': motion.trusted_ns, 'judge': {name: getattr(state.judge, name) for name in _JUDGE},
     }  # fmt: skip
     arrays = {_MAP + name: array for name, array in state.map.items()}
+    arrays |= {_PLACES + name: array for name, array in state.places.items()}
     arrays |= {'T_world_cam': motion.T_world_cam, 'velocity': motion.velocity}
     arrays |= {'T_world_cam_trusted': motion.T_world_cam_trusted, 'pose_covariance': state.judge.covariance}
-    return Content(values, arrays)
+    relocaliser = _relocaliser_content(state.relocaliser)
+    arrays |= {_GRAPH + name: array for name, array in state.graph.items()}
+    poses = [keyframe.T_cam_world.numpy(force=True) for keyframe in state.keyframes]
+    arrays[_KEYFRAME_POSES] = np.array(poses, np.float32).reshape(-1, 4, 4)
+    return Content({**values, **relocaliser.values}, {**arrays, **relocaliser.arrays})
+
+
+def _relocaliser_content(state: RelocaliserState) -> Content:
+    recognised = state.recognised
+    values = {
+        'num_in_doubt': state.num_in_doubt, 'is_anywhere': state.is_anywhere,
+        'recognised': None if recognised is None else [recognised.stamp_ns, recognised.keyframe],
+    }  # fmt: skip
+    arrays = {} if state.told is None else {'told': state.told}
+    if recognised is not None:
+        arrays |= {'recognised_T_world_cam': recognised.T_world_cam, 'recognised_covariance': recognised.covariance}
+    return Content({'relocaliser': values}, arrays)
+
+
+def _relocaliser_state(content: Content) -> RelocaliserState:
+    """Returns the state in a checkpoint.
+
+    Raises:
+        KeyError: a part is missing.
+        ValueError: a part is not what it should be.
+    """
+    values, arrays = content.values.get('relocaliser'), content.arrays
+    if values is None:  # 0.2.0 had none
+        return RelocaliserState()
+    stamped, recognised = values['recognised'], None
+    if stamped is not None:
+        recognised = Recognition(stamped[0], arrays['recognised_T_world_cam'], arrays['recognised_covariance'], stamped[1])
+    numbers = [values['num_in_doubt'], *(stamped or ())]
+    if any(type(number) is not int or abs(number) >= 2**63 for number in numbers) or type(values['is_anywhere']) is not bool:
+        raise ValueError(f'relocaliser = {values}: expected whole numbers')
+    for name, shape in _RELOCALISER.items():
+        array = arrays.get(name)
+        if array is not None and (array.dtype != np.float64 or array.shape != shape or not np.isfinite(array).all()):
+            raise ValueError(f'{name}: expected {shape} finite numbers')
+    return RelocaliserState(values['num_in_doubt'], values['is_anywhere'], arrays.get('told'), recognised)
 
 
 def _from_content(path: Path, content: Content) -> Checkpoint:
@@ -202,7 +245,7 @@ def _from_content(path: Path, content: Content) -> Checkpoint:
         config=with_values(SlamConfig(), migrated(values['config'])),
         camera=camera,
         map={name.removeprefix(_MAP): array for name, array in arrays.items() if name.startswith(_MAP)},
-        keyframes=tuple(_read_keyframe(path.parent, digest, camera) for digest in values['keyframes']),
+        keyframes=_placed([_read_keyframe(path.parent, digest, camera) for digest in values['keyframes']], arrays),
         motion=MotionState(
             stamp_ns=stamp_ns,
             interval_ns=interval_ns,
@@ -216,7 +259,10 @@ def _from_content(path: Path, content: Content) -> Checkpoint:
         scene_radius=values['scene_radius'],
         num_frames=values['num_frames'],
         last_stamp_ns=values['last_stamp_ns'],
+        graph={name.removeprefix(_GRAPH): array for name, array in arrays.items() if name.startswith(_GRAPH)},
         judge=JudgeState() if 'judge' not in values else JudgeState(**values['judge'], covariance=arrays['pose_covariance']),
+        relocaliser=_relocaliser_state(content),
+        places={name.removeprefix(_PLACES): array for name, array in arrays.items() if name.startswith(_PLACES)},
     )
     return Checkpoint(path, state, Progress(**values['progress']))
 
@@ -275,6 +321,20 @@ def _read_keyframe(folder: Path, digest: str, camera: PinholeCamera | None) -> P
         raise CheckpointError(f'{path}: is no keyframe of this run: its frame is {frame!r}')
     view = View(camera, torch.from_numpy(rgb8), torch.from_numpy(depth), spacing)
     return PosedView(view, torch.from_numpy(T_cam_world), frame)
+
+
+def _placed(keyframes: Sequence[PosedView], arrays: Arrays) -> tuple[PosedView, ...]:
+    """Returns keyframes where they were when the checkpoint was written; before 0.3 they never moved.
+
+    Raises:
+        ValueError: their poses are not theirs.
+    """
+    poses = arrays.get(_KEYFRAME_POSES)
+    if poses is None:
+        return tuple(keyframes)
+    if poses.dtype != np.float32 or poses.shape != (len(keyframes), 4, 4) or not np.isfinite(poses).all():
+        raise ValueError(f'{_KEYFRAME_POSES}: expected {len(keyframes)} poses, finite float32')
+    return tuple(replace(keyframe, T_cam_world=torch.from_numpy(pose)) for keyframe, pose in zip(keyframes, poses))
 
 
 def _keyframe_path(folder: Path, digest: str) -> Path:

@@ -19,6 +19,7 @@ from splatam_core.types import FrameResult, PoseCovariance, StageTimings, Status
 _log = logging.getLogger(__name__)
 
 STAGES = tuple(entry.name for entry in fields(StageTimings))
+_FIRST_STAGES = tuple(stage for stage in STAGES if stage != 'graph')  # 0.1.0 knew these
 LOST = '# lost '
 """Begins the line of a lost frame in ``trajectory.txt``; for other programs the line is a comment."""
 AXES = 'x', 'y', 'z', 'rx', 'ry', 'rz'
@@ -26,8 +27,9 @@ UPPER = tuple((row, column) for row in range(6) for column in range(row, 6))
 """The entries of a symmetric [6, 6] matrix that are written."""
 CSV_HEADER = [
     'stamp', 'status', 'is_keyframe', 'num_gaussians', 'visible_fraction', 'inlier_fraction', 'process_ms', 'decode_ms',
-    *(f'{stage}_ms' for stage in STAGES), 'reason',
+    *(f'{stage}_ms' for stage in _FIRST_STAGES), 'reason',
     'num_held', 'drift_position_m', 'drift_rotation_rad', *(f'cov_{AXES[row]}_{AXES[column]}' for row, column in UPPER),
+    'is_relocalised', 'graph_ms',
 ]  # fmt: skip
 """Columns are only ever added at the end: a folder of an earlier version can then be continued."""
 
@@ -49,6 +51,7 @@ class FrameRecord:
         reason: why the frame is uncertain or lost; empty otherwise.
         covariance: see ``FrameResult``.
         num_held: see ``FrameResult``.
+        is_relocalised: see ``FrameResult``.
     """
 
     stamp_ns: int
@@ -63,6 +66,7 @@ class FrameRecord:
     reason: str
     covariance: PoseCovariance | None = None
     num_held: int = 0
+    is_relocalised: bool = False
 
     @classmethod
     def of(cls, result: FrameResult, process_s: float, decode_s: float | None) -> FrameRecord:
@@ -86,16 +90,18 @@ class FrameRecord:
             reason=result.reason,
             covariance=result.covariance,
             num_held=result.num_held,
+            is_relocalised=result.is_relocalised,
         )
 
     def csv_row(self) -> list[str]:
         """Returns the cells below ``CSV_HEADER``."""
-        times_ms = [getattr(self.timings, stage) for stage in STAGES]
+        times_ms = [getattr(self.timings, stage) for stage in _FIRST_STAGES]
         return [
             stamp_text(self.stamp_ns), self.status.value, str(int(self.is_keyframe)), str(self.num_gaussians),
             f'{self.visible_fraction:.4f}', f'{self.inlier_fraction:.4f}', f'{self.process_ms:.3f}',
             '' if self.decode_ms is None else f'{self.decode_ms:.3f}', *(f'{time_ms:.3f}' for time_ms in times_ms),
-            self.reason, str(self.num_held), *_covariance_cells(self.covariance),
+            self.reason, str(self.num_held), *_covariance_cells(self.covariance), str(int(self.is_relocalised)),
+            f'{self.timings.graph:.3f}',
         ]  # fmt: skip
 
 
@@ -204,10 +210,11 @@ def _frame_record(row: dict[str, str]) -> FrameRecord:
         inlier_fraction=_number(row['inlier_fraction']),
         process_ms=_number(row['process_ms']),
         decode_ms=_number(row['decode_ms']) if row['decode_ms'] else None,
-        timings=StageTimings(*(_number(row[f'{stage}_ms']) for stage in STAGES)),
+        timings=StageTimings(**{stage: _number(row.get(f'{stage}_ms') or '0') for stage in STAGES}),
         reason=row['reason'],
         covariance=_covariance(row),
         num_held=int(row.get('num_held') or 0),
+        is_relocalised=row.get('is_relocalised') == '1',
     )
 
 

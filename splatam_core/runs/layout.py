@@ -3,8 +3,10 @@
 ``splatam run`` and the node write a run folder; ``splatam evaluate`` and the other commands read it::
 
     trajectory.txt   one line per frame, written at once: 'stamp tx ty tz qx qy qz qw', or '# lost stamp'
+    trajectory_final.txt   the same poses after all corrections of the keyframe graph
     frames.csv       one line per frame: status, fractions, times
     map.ply          the Gaussians
+    map.keyframes    the keyframes of the map, where lost cameras are looked for by them, see map_keyframes.py
     metrics.json     the numbers; null until evaluated
     config.yaml      every setting
     run.json         source, camera, commit, machine, library versions
@@ -25,16 +27,18 @@ from splatam_core.errors import RunFolderError, one_line
 from splatam_core.text_files import read_json
 
 TRAJECTORY = 'trajectory.txt'
+FINAL_TRAJECTORY = 'trajectory_final.txt'
 FRAMES = 'frames.csv'
 MAP = 'map.ply'
+MAP_KEYFRAMES = 'map.keyframes'
 METRICS = 'metrics.json'
 CONFIG = 'config.yaml'
 RUN = 'run.json'
 SCORES = 'scores.csv'
 REPORT = 'report.png'
 PAGE = 'report.html'
-FILES = (TRAJECTORY, FRAMES, MAP, METRICS, CONFIG, RUN, SCORES, REPORT, PAGE)
-RESULTS = (MAP, METRICS, SCORES, REPORT, PAGE)
+FILES = (TRAJECTORY, FINAL_TRAJECTORY, FRAMES, MAP, MAP_KEYFRAMES, METRICS, CONFIG, RUN, SCORES, REPORT, PAGE)
+RESULTS = (FINAL_TRAJECTORY, MAP, MAP_KEYFRAMES, METRICS, SCORES, REPORT, PAGE)
 """The files that depend on every frame of the run."""
 CHECKPOINTS = 'checkpoints'
 PREVIOUS = 'previous'

@@ -85,6 +85,7 @@ class Metrics:
         finish_s: wall time of the final passes over the keyframes after the last frame; both rates include it.
         peak_gpu_mb: largest memory of its tensors on a GPU, MiB; None where no GPU was used.
         uncertain: number of frames with a pose that may be wrong; they are not mapped.
+        relocalised: number of times that the camera was found anew in the map.
         ate_rmse_m: root mean squared distance of the camera centres to the ground truth, all frames with a pose, SE(3)-aligned.
         ate_frames: number of frames with a pose and ground truth, which enter ``ate_rmse_m``.
         ate_tracked_rmse_m: the same over the tracked frames alone, aligned by themselves.
@@ -115,6 +116,9 @@ class Metrics:
         novel_holes_frames: number of test views with holes.
         novel_holes: their scores.
         splatam_novel: the views without holes, scored as the original does.
+        ate_final_rmse_m: ``ate_rmse_m`` of the poses after all corrections of the keyframe graph.
+        loops: number of places that were recognised; None without a graph.
+        corrections: number of times that poses and map were corrected by them.
         notes: why a number is null, by its name, where that is not obvious.
     """
 
@@ -129,6 +133,7 @@ class Metrics:
     finish_s: float = 0.0
     peak_gpu_mb: float | None = None
     uncertain: int = 0
+    relocalised: int = 0
     ate_rmse_m: float | None = None
     ate_frames: int | None = None
     ate_tracked_rmse_m: float | None = None
@@ -159,6 +164,9 @@ class Metrics:
     novel_holes_frames: int | None = None
     novel_holes: ImageScores = ImageScores()
     splatam_novel: OriginalScores = OriginalScores()
+    ate_final_rmse_m: float | None = None
+    loops: int | None = None
+    corrections: int | None = None
     notes: Mapping[str, str] = field(default_factory=dict)
 
     def values(self) -> dict[str, Any]:
@@ -201,7 +209,7 @@ class Metrics:
         """Raises ValueError where a value is not of its kind."""
         values = self.values() | {f'timings_ms.{name}': stage.median for name, stage in self.timings_ms.items()}
         values |= {f'timings_ms.{name}.p95': stage.p95 for name, stage in self.timings_ms.items()}
-        counts, other = ('frames', 'tracked', 'uncertain', 'lost'), ('timings_ms', 'notes', 'novel_alignment')
+        counts, other = ('frames', 'tracked', 'uncertain', 'lost', 'relocalised'), ('timings_ms', 'notes', 'novel_alignment')
         for name, value in values.items():
             is_number = type(value) in (int, float) and math.isfinite(value)
             is_right = type(value) is int if name in counts else value is None or is_number
@@ -235,10 +243,11 @@ class FrameStatistics:
         frames: number of frames.
         uncertain: number of frames with a pose that may be wrong.
         lost: number of frames without a pose.
+        relocalised: number of times that the camera was found anew.
     """
 
     def __init__(self, records: Iterable[FrameRecord] = ()) -> None:
-        self.frames = self.uncertain = self.lost = 0
+        self.frames = self.uncertain = self.lost = self.relocalised = 0
         self._process_ms = self._decode_ms = 0.0
         self._num_decoded = 0
         self._timings = array('d')  # of all frames, or of so many drawn at random
@@ -256,6 +265,7 @@ class FrameStatistics:
         self.frames += 1
         self.uncertain += record.status is Status.UNCERTAIN
         self.lost += record.status is Status.LOST
+        self.relocalised += record.is_relocalised
         self._process_ms += record.process_ms
         if record.decode_ms is not None:
             self._decode_ms += record.decode_ms
@@ -272,6 +282,7 @@ class FrameStatistics:
             tracked=self.frames - self.uncertain - self.lost,
             uncertain=self.uncertain,
             lost=self.lost,
+            relocalised=self.relocalised,
             fps=_rate(self.frames, process_ms),
             fps_with_io=_rate(self.frames, process_ms + self._decode_ms if self._num_decoded == self.frames else 0.0),
             num_gaussians=num_gaussians,

@@ -20,7 +20,7 @@ from splatam_core.geometry.trajectory import Trajectory
 from splatam_core.maps.ply import read_ply
 from splatam_core.rasterizer import Gaussians
 from splatam_core.runs.frame_records import FrameRecord, complete_lines, is_frame, read_frame_records, read_lost, read_poses
-from splatam_core.runs.layout import CONFIG, FRAMES, MAP, METRICS, RUN, TRAJECTORY, why_not
+from splatam_core.runs.layout import CONFIG, FINAL_TRAJECTORY, FRAMES, MAP, METRICS, RUN, TRAJECTORY, why_not
 from splatam_core.runs.metrics import Metrics, run_metrics
 from splatam_core.text_files import read_json, read_text
 from splatam_core.types import PoseCovariance, Status
@@ -120,11 +120,13 @@ class RunRecord(RunSettings):
         trajectory: the frames with a pose, tracked and uncertain.
         lost_ns: stamps of the lost frames.
         frames: one record per frame; empty where there is no ``frames.csv``.
+        final: the frames with a pose when the map was saved, after all corrections of the graph; None where that is not known.
     """
 
     trajectory: Trajectory
     lost_ns: tuple[int, ...]
     frames: tuple[FrameRecord, ...]
+    final: Trajectory | None = None
 
     def stamps_ns(self) -> list[int]:
         """Returns the stamps of all frames in order, lost ones included: the n-th is the one of frame n of the run."""
@@ -140,17 +142,27 @@ class RunRecord(RunSettings):
         """Returns the covariances of the poses, by stamp; those of frames without one are missing."""
         return {frame.stamp_ns: frame.covariance for frame in self.frames if frame.covariance is not None}
 
+    def in_final_map(self) -> Trajectory:
+        """Returns the frames with a pose, where they are in the final map; those after it was saved as they were published."""
+        if self.final is None:
+            return self.trajectory
+        later = ~np.isin(self.trajectory.stamps_ns, self.final.stamps_ns)
+        poses = np.concatenate([self.final.T_world_cam, self.trajectory.T_world_cam[later]])
+        stamps_ns = np.concatenate([self.final.stamps_ns, self.trajectory.stamps_ns[later]])
+        order = np.argsort(stamps_ns)
+        return Trajectory(stamps_ns[order], poses[order])
+
     def poses(self) -> dict[int, NDArray[np.float64]]:
-        """Returns T_world_cam [4, 4] of the frames with a pose, by stamp."""
-        return dict(zip(map(int, self.trajectory.stamps_ns), self.trajectory.T_world_cam))
+        """Returns T_world_cam [4, 4] in the final map of the frames with a pose, by stamp."""
+        trajectory = self.in_final_map()
+        return dict(zip(map(int, trajectory.stamps_ns), trajectory.T_world_cam))
 
     def mapped_poses(self) -> dict[int, NDArray[np.float64]]:
-        """Returns the poses of the tracked frames that were not held out of the map, by stamp."""
+        """Returns the poses in the final map of the tracked frames that were not held out of it, by stamp."""
         is_held_out = self.config.mapping.is_held_out
         held_out = {stamp_ns for index, stamp_ns in enumerate(self.stamps_ns()) if is_held_out(index)}
-        tracked = self.tracked_trajectory()
-        poses = zip(map(int, tracked.stamps_ns), tracked.T_world_cam)
-        return {stamp_ns: pose for stamp_ns, pose in poses if stamp_ns not in held_out}
+        mapped = set(map(int, self.tracked_trajectory().stamps_ns)) - held_out
+        return {stamp_ns: pose for stamp_ns, pose in self.poses().items() if stamp_ns in mapped}
 
     def read_map(self) -> Gaussians:
         """Reads the map.
@@ -248,9 +260,15 @@ def read_run(path: Path) -> RunRecord:
             machine=settings.machine,
             versions=settings.versions,
             trajectory=read_poses(lines, TRAJECTORY),
+            final=_read_final(path),
             lost_ns=read_lost(lines),
             frames=records,
         )
+
+
+def _read_final(path: Path) -> Trajectory | None:
+    file = path / FINAL_TRAJECTORY
+    return read_poses(complete_lines(file), FINAL_TRAJECTORY) if file.exists() else None
 
 
 def _in_both(path: Path, lines: list[str], records: tuple[FrameRecord, ...]) -> tuple[list[str], tuple[FrameRecord, ...]]:

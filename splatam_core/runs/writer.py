@@ -7,6 +7,7 @@ import io
 import json
 import os
 import shutil
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from datetime import datetime, timezone
@@ -19,17 +20,22 @@ from splatam_core.config import SlamConfig, to_yaml
 from splatam_core.device import choose_backend
 from splatam_core.errors import RunFolderError
 from splatam_core.geometry.camera import PinholeCamera
-from splatam_core.geometry.trajectory import stamp_from_text
+from splatam_core.geometry.trajectory import pose_line, stamp_from_text
+from splatam_core.graph.keyframe_graph import KeyframeGraph
+from splatam_core.graph.places import Places
 from splatam_core.mapping.gaussian_map import GaussianMap
+from splatam_core.mapping.posed import PosedView
 from splatam_core.maps.ply import write_ply
 from splatam_core.rasterizer import Gaussians
 from splatam_core.runs import provenance
-from splatam_core.runs.frame_records import CSV_HEADER, LOST, FrameRecord, trajectory_line
+from splatam_core.runs.frame_records import CSV_HEADER, LOST, FrameRecord, complete_lines, read_poses, trajectory_line
 from splatam_core.runs.layout import (
     CONFIG,
     FILES,
+    FINAL_TRAJECTORY,
     FRAMES,
     MAP,
+    MAP_KEYFRAMES,
     METRICS,
     PREVIOUS,
     RESULTS,
@@ -41,6 +47,7 @@ from splatam_core.runs.layout import (
     why_not,
 )
 from splatam_core.runs.line_file import LineFile
+from splatam_core.runs.map_keyframes import write_map_keyframes
 from splatam_core.runs.metrics import FrameStatistics, Metrics
 from splatam_core.runs.record import RunDescription, RunRecord, read_errors, read_run
 from splatam_core.text_files import read_json
@@ -55,6 +62,18 @@ class SavableSlam(Protocol):
     @property
     def map(self) -> GaussianMap:
         """The map."""
+
+    @property
+    def keyframes(self) -> Sequence[PosedView]:
+        """Its keyframes, in the host's memory."""
+
+    @property
+    def places(self) -> Places:
+        """The keyframes as places."""
+
+    @property
+    def graph(self) -> KeyframeGraph:
+        """Corrects the poses."""
 
 
 class RunFolder:
@@ -232,10 +251,12 @@ class RunFolder:
         replace_text(self.path / RUN, _to_json(information))
 
     def save(self, slam: SavableSlam, finish_s: float = 0.0) -> Metrics:
-        """Writes ``map.ply``, ``metrics.json`` and the present settings. May be called again later.
+        """Writes ``map.ply``, its keyframes, the corrected poses, ``metrics.json`` and the present settings.
+
+        It may be called again later.
 
         Args:
-            slam: its map and settings are written.
+            slam: its map, keyframes and settings are written, and its graph corrects the poses.
             finish_s: wall time in ``Slam.finish``.
 
         Raises:
@@ -245,12 +266,30 @@ class RunFolder:
         replace_text(self.path / CONFIG, to_yaml(slam.config))
         gaussians = slam.map.gaussians
         write_ply(self.path / MAP, gaussians)
+        if slam.config.tracking.relocalises:
+            write_map_keyframes(self.path / MAP_KEYFRAMES, slam.keyframes, slam.places.arrays())
+        else:
+            (self.path / MAP_KEYFRAMES).unlink(missing_ok=True)
+        self._write_final_trajectory(slam.graph)
         metrics = _metrics_of_this_process(self._statistics, len(gaussians), finish_s)
+        if slam.graph.is_used:
+            metrics = replace(metrics, loops=slam.graph.num_loops, corrections=slam.graph.num_corrections)
         if slam.map.num_refused:
             refused = f'{slam.map.num_refused} Gaussians were not finite and were left out of the map'
             metrics = replace(metrics, notes={**metrics.notes, 'num_gaussians': refused})
         replace_text(self.path / METRICS, metrics.to_json())
         return metrics
+
+    def _write_final_trajectory(self, graph: KeyframeGraph) -> None:
+        """Writes the poses so far as the graph corrects them; lost frames stay comments."""
+        self._trajectory.flush()
+        with read_errors(self.path):
+            lines = complete_lines(self.path / TRAJECTORY)
+            online = read_poses(lines, TRAJECTORY)
+        final = iter(graph.corrected(online.stamps_ns, online.T_world_cam))
+        stamps = iter(online.stamps_ns)
+        texts = [line if line.startswith('#') else pose_line(int(next(stamps)), next(final)) for line in lines if line.strip()]
+        replace_text(self.path / FINAL_TRAJECTORY, ''.join(f'{text}\n' for text in texts))
 
     def finish(self, slam: SavableSlam, finish_s: float = 0.0) -> Metrics:
         """Saves, and closes the files. Arguments, result and errors are those of ``save``."""
@@ -309,7 +348,7 @@ def write_refined(run: RunRecord, path: Path, gaussians: Gaussians, iterations: 
     check_is_free(path)
     try:
         with new_folder(path) as folder:
-            for name in (TRAJECTORY, FRAMES, CONFIG):
+            for name in (TRAJECTORY, FINAL_TRAJECTORY, FRAMES, CONFIG, MAP_KEYFRAMES):
                 if (run.path / name).exists():
                     shutil.copy2(run.path / name, folder)
             replace_text(folder / RUN, _to_json(information))

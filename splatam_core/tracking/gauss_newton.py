@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -89,13 +90,18 @@ class Alignment:
         state: the state.
         system: the residuals at the finest level.
         time_offset: between colour and depth, after this frame.
-        evidence: what the residuals say about the state.
+        weigh: returns what the residuals say about the state; it takes as long as a step.
     """
 
     state: AlignmentState
     system: LinearSystem
     time_offset: TimeOffset
-    evidence: Evidence
+    weigh: Callable[[], Evidence]
+
+    @property
+    def evidence(self) -> Evidence:
+        """What the residuals say about the state."""
+        return self.weigh()
 
 
 class GaussNewton:
@@ -114,20 +120,26 @@ class GaussNewton:
         self._estimates_time_offset = align.time_offset
 
     def align(
-        self, references: Sequence[Level], frames: Sequence[Level], predicted_motion: Matrix | None, time_offset: TimeOffset
+        self,
+        references: Sequence[Level],
+        frames: Sequence[Level],
+        predicted_motion: Matrix | None,
+        time_offset: TimeOffset,
+        start_motion: Matrix | None = None,
     ) -> Alignment:
-        """Aligns from coarse to fine, starting where the reference was rendered.
+        """Aligns from coarse to fine, starting where the reference was rendered, or at another motion.
 
         Args:
             references: pyramid of the render, finest level first.
             frames: pyramid of the frame, with the same cameras.
             predicted_motion: [4, 4] from the camera one frame ago to the render's; None if that is not known.
             time_offset: between colour and depth, before this frame.
+            start_motion: [4, 4] from the reference's camera to the frame's; None = none.
 
         Returns:
             The state found, or the start where that explains the finest level better.
         """
-        start = state = AlignmentState(np.eye(4))
+        start = state = AlignmentState(np.eye(4) if start_motion is None else start_motion)
         if self._estimates_time_offset and predicted_motion is not None:
             state = replace(state, time_offset=time_offset.mean)
         scales = _FIRST_SCALES
@@ -141,8 +153,8 @@ class GaussNewton:
             after = time_offset.updated(state.time_offset, self._time_offset_information(system))
         at_start = self._linearize(pair, start, scales)
         if not _is_better(at_start, system):
-            return Alignment(start, at_start, time_offset, self._weigh(pair, start, scales))
-        return Alignment(state, system, after, self._weigh(pair, state, scales))
+            return Alignment(start, at_start, time_offset, partial(self._weigh, pair, start, scales))
+        return Alignment(state, system, after, partial(self._weigh, pair, state, scales))
 
     def _iterate(
         self, pair: _Pair, state: AlignmentState, scales: tuple[float, float]

@@ -156,6 +156,10 @@ class MotionModel:
             self._velocity = step / (self._interval_ns * 1e-9)
         self._stamp_ns, self._T_world_cam, self._trusted_ns = stamp_ns, T_world_cam, None
 
+    def correct(self, motion: Matrix) -> None:
+        """Moves all poses by a motion [4, 4] of the world, because map and poses were corrected; the velocity stays."""
+        self._T_world_cam, self._T_world_cam_trusted = motion @ self._T_world_cam, motion @ self._T_world_cam_trusted
+
     def place(self, T_world_cam: Matrix) -> None:
         """Sets the pose, at rest; the next frame may have any stamp."""
         self.stop()

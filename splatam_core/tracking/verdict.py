@@ -188,6 +188,13 @@ class Judge:
         self.state = JudgeState()
         return Verdict(Status.INITIALIZED, covariance=PoseCovariance(self.state.covariance, 0.0, 0.0))
 
+    def relocate(self, state: JudgeState, verdict: Verdict) -> Verdict:
+        """Takes over what another judge says about a camera that was found elsewhere in the map; the drift stays as it is."""
+        drift = self._drift()
+        self.state = replace(state, position_drift=self.state.position_drift, rotation_drift=self.state.rotation_drift)
+        covariance = None if verdict.covariance is None else PoseCovariance(verdict.covariance.relative, *drift)
+        return replace(verdict, covariance=covariance, corrects=False)
+
     def choose(
         self, found: Sequence[TrackingResult], predictions: Sequence[Prediction], config: TrackingConfig
     ) -> tuple[TrackingResult, Verdict]:

@@ -67,7 +67,7 @@ class MotionEstimator:
             return Motion(pose_covariance, total, np.zeros(6), UNKNOWN_VARIANCE * np.eye(6))
         before, covariance_before = previous
         seconds = (located.stamp_ns - before.stamp_ns) * 1e-9
-        twist = se3.log(se3.inverse(before.T_map_body) @ located.T_map_body) / seconds
+        twist = se3.log(se3.inverse(before.T_steady_body) @ located.T_steady_body) / seconds
         J = np.kron(np.eye(2), located.T_map_body[:3, :3].T)  # [6, 6] from map axes to body axes
         return Motion(pose_covariance, total, twist, J @ (covariance + covariance_before) @ J.T / seconds**2)
 

@@ -8,7 +8,7 @@ if there is no base.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,7 @@ class Located:
         T_map_camera: [4, 4] pose of the camera in the map.
         T_map_body: [4, 4] pose of the body in the map.
         T_map_odom: [4, 4] correction of the odometry; None if the odometry is not known at this stamp.
+        T_map_steady: [4, 4] all corrections of the map by loops: poses times its inverse never jump.
     """
 
     stamp_ns: int
@@ -51,6 +52,12 @@ class Located:
     T_map_camera: Matrix
     T_map_body: Matrix
     T_map_odom: Matrix | None
+    T_map_steady: Matrix = field(default_factory=lambda: np.eye(4))
+
+    @property
+    def T_steady_body(self) -> Matrix:
+        """[4, 4] pose of the body in a frame in which it never jumps."""
+        return se3.inverse(self.T_map_steady) @ self.T_map_body
 
 
 class CoordinateFrames:
@@ -88,7 +95,9 @@ class CoordinateFrames:
         """Returns the name of the located body: the base, or the camera if there is no base."""
         return self._options.base_frame or camera_frame
 
-    def locate(self, stamp_ns: int, frame_id: str, T_world_cam: Matrix, T_map_world: Matrix | None) -> Located | None:
+    def locate(
+        self, stamp_ns: int, frame_id: str, T_world_cam: Matrix, T_map_world: Matrix | None, T_world_odom: Matrix | None = None
+    ) -> Located | None:
         """Express a tracked camera in the coordinate frames of ROS.
 
         Args:
@@ -96,6 +105,7 @@ class CoordinateFrames:
             frame_id: frame id of its colour image.
             T_world_cam: [4, 4] camera to the core's world.
             T_map_world: [4, 4] core's world to map; None for the first located frame of a world, which defines it.
+            T_world_odom: [4, 4] all corrections of the core's world so far; None = none.
 
         Returns:
             None, after a warning, while the pose of the camera in the base is not known.
@@ -112,6 +122,9 @@ class CoordinateFrames:
         if T_map_world is None:
             T_map_world = self._new_map(T_body_camera)
         T_map_camera = T_map_world @ T_world_cam
+        T_map_steady = np.eye(4)
+        if T_world_odom is not None and not (T_world_odom == np.eye(4)).all():
+            T_map_steady = T_map_world @ T_world_odom @ se3.inverse(T_map_world)
         return Located(
             stamp_ns=stamp_ns,
             camera_frame=camera_frame,
@@ -119,8 +132,28 @@ class CoordinateFrames:
             T_map_world=T_map_world,
             T_map_camera=T_map_camera,
             T_map_body=T_map_camera @ se3.inverse(T_body_camera),
-            T_map_odom=self._T_map_odom(T_map_camera, camera_frame, stamp_ns),
+            T_map_odom=self._T_map_odom(T_map_camera, camera_frame, stamp_ns) if self._options.has_odometry else T_map_steady,
+            T_map_steady=T_map_steady,
         )
+
+    def told(self, stamp_ns: int, frame_id: str, T_map_body: Matrix, T_map_world: Matrix | None) -> Matrix:
+        """Returns the [4, 4] pose of the camera in the core's world that a person means by a pose of the body in the map.
+
+        Without a base the pose is that of the camera in body axes: its x axis is where the camera looks.
+
+        Args:
+            stamp_ns: stamp of the frame that the pose is for.
+            frame_id: frame id of its colour image.
+            T_map_body: [4, 4] what the person says.
+            T_map_world: [4, 4] core's world to map; None before the first located frame of a world.
+
+        Raises:
+            TransformError: the pose of the camera in the base is not known.
+        """
+        T_body_camera = self._T_body_camera(self.camera_frame(frame_id), stamp_ns)
+        if T_map_world is None:
+            T_map_world = self._new_map(T_body_camera)
+        return se3.inverse(T_map_world) @ T_map_body @ (T_body_camera if self._options.base_frame else T_BODY_OPTICAL)
 
     def odometry(self, camera_frame: str, stamp_ns: int, timeout_s: float = 0.0) -> Matrix:
         """Returns the [4, 4] pose of the camera in the odometry's frame.
@@ -150,7 +183,7 @@ class CoordinateFrames:
             return {}
         if not odom_frame:
             return {(map_frame, located.body_frame): located.T_map_body}
-        return {(map_frame, odom_frame): np.eye(4), (odom_frame, located.body_frame): located.T_map_body}
+        return {(map_frame, odom_frame): located.T_map_steady, (odom_frame, located.body_frame): located.T_steady_body}
 
     def lasting(self, moving: Mapping[Link, Matrix]) -> dict[Link, Matrix]:
         """Returns those of the moving transforms that still hold while the camera is lost: the correction of the odometry."""
@@ -184,8 +217,6 @@ class CoordinateFrames:
         return T_body_camera if self._options.base_frame else T_BODY_OPTICAL
 
     def _T_map_odom(self, T_map_camera: Matrix, camera_frame: str, stamp_ns: int) -> Matrix | None:
-        if not self._options.has_odometry:
-            return np.eye(4)
         try:
             return T_map_camera @ se3.inverse(self.odometry(camera_frame, stamp_ns))
         except TransformError:  # OdometryPrior has waited for it and has warned

@@ -67,9 +67,15 @@ class RobotFrames:
         if self.prior is not None:
             self.prior.camera_frame = self._frames.camera_frame(frame.frame_id)
 
-    def locate(self, frame: RgbdFrame, T_world_cam: Matrix, T_map_world: Matrix | None) -> Located | None:
+    def locate(
+        self, frame: RgbdFrame, T_world_cam: Matrix, T_map_world: Matrix | None, T_world_odom: Matrix | None = None
+    ) -> Located | None:
         """Express a tracked camera in the coordinate frames of ROS; see ``CoordinateFrames.locate``."""
-        return self._frames.locate(frame.stamp_ns, frame.frame_id, T_world_cam, T_map_world)
+        return self._frames.locate(frame.stamp_ns, frame.frame_id, T_world_cam, T_map_world, T_world_odom)
+
+    def told(self, frame: RgbdFrame, T_map_body: Matrix, T_map_world: Matrix | None) -> Matrix:
+        """Returns where in the core's world a person says that the camera of a frame is; see ``CoordinateFrames.told``."""
+        return self._frames.told(frame.stamp_ns, frame.frame_id, T_map_body, T_map_world)
 
     def begin_map(self) -> None:
         """Forget where the odometry is in the map: a new one begins."""

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from msg_adapters import stamps
 from msg_adapters.factory import MessageFactory, RclpyMessages, message_class
 from splatam_core.errors import FrameError
-from splatam_core.types import FrameResult, Status
+from splatam_core.types import FrameResult, GraphSummary, Status
 
 OK, WARN, ERROR = b'\x00', b'\x01', b'\x02'
 TYPE_NAME = 'diagnostic_msgs/msg/DiagnosticArray'
@@ -58,6 +58,8 @@ class Sample:
         rss_mb: memory of the process; None if it is not known.
         problem: why no frames are received; empty while they are.
         camera_frame: coordinate frame of the camera; empty before the first frame.
+        relocalised: number of times that a lost camera was found anew in the map.
+        graph: what the keyframe graph holds.
     """
 
     monotonic_s: float
@@ -73,6 +75,8 @@ class Sample:
     rss_mb: float | None
     problem: str
     camera_frame: str
+    relocalised: int = 0
+    graph: GraphSummary = GraphSummary()
 
 
 class FrameCounters:
@@ -81,18 +85,21 @@ class FrameCounters:
     Attributes:
         by_status: number of processed frames by status.
         refused: number of frames that SLAM could not use.
+        relocalised: number of times that a lost camera was found anew in the map.
         failed: number of frames for which SLAM or publishing failed.
         newest: result of the newest frame; None before the first.
         delay_s: time from the newest pose's stamp to its publication; None before the first pose.
         frame_id: frame id of the newest frame's colour image; empty before the first.
+        graph: what the keyframe graph holds after the newest frame.
     """
 
     def __init__(self) -> None:
         self.by_status = dict.fromkeys(Status, 0)
-        self.refused = self.failed = 0
+        self.refused = self.failed = self.relocalised = 0
         self.newest: FrameResult | None = None
         self.delay_s: float | None = None
         self.frame_id = ''
+        self.graph = GraphSummary()
 
     @property
     def total(self) -> int:
@@ -111,11 +118,19 @@ class FrameCounters:
         else:
             self.failed += 1
 
-    def add(self, result: FrameResult, frame_id: str) -> None:
+    def add(self, result: FrameResult, frame_id: str, graph: GraphSummary | None = None) -> None:
         """Count a processed frame."""
         self.by_status[result.status] += 1
-        self.newest = result
+        self.relocalised += result.is_relocalised
+        self.newest, self.graph = result, graph or GraphSummary()
         self.frame_id = frame_id
+
+    def progress(self, result: FrameResult) -> str:
+        """Returns a line for the log, after a frame."""
+        return (
+            f'frame {self.total}: {self.by_status[Status.UNCERTAIN]} uncertain and {self.by_status[Status.LOST]} lost so far, '
+            f'{result.num_gaussians} Gaussians, {result.timings.total:.0f} ms for this frame'
+        )
 
 
 class DiagnosticsPublisher:
@@ -196,6 +211,7 @@ def tracking_report(now: Sample) -> Report:
     values |= {
         'position standard deviation (m)': _number(_deviation_m(result), 4),
         'directions held by the prediction': str(result.num_held),
+        'times found anew in the map': str(now.relocalised),
     }
     if result.status is Status.LOST:
         return Report('tracking', ERROR, f'lost: {result.reason}', values)
@@ -230,9 +246,17 @@ def processing_report(before: Sample, now: Sample) -> Report:
 
 
 def map_report(now: Sample) -> Report:
-    """Report on the size of the map."""
-    count = now.result.num_gaussians if now.result else 0
-    return Report('map', OK, f'{count} Gaussians', {'Gaussians': str(count), 'memory (MB)': _number(now.rss_mb, 0)})
+    """Report on the size of the map, and on its corrections."""
+    count, graph = now.result.num_gaussians if now.result else 0, now.graph
+    values = {
+        'Gaussians': str(count),
+        'memory (MB)': _number(now.rss_mb, 0),
+        'keyframes in the graph': str(graph.nodes),
+        'loops': str(graph.loops),
+        'corrections': str(graph.corrections),
+        'last correction (m)': _number(graph.last_correction_m if graph.corrections else None, 3),
+    }
+    return Report('map', OK, f'{count} Gaussians', values)
 
 
 def message(factory: MessageFactory, found: Sequence[Report], stamp_ns: int, node_name: str, hardware_id: str) -> Any:

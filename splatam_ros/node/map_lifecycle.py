@@ -17,9 +17,12 @@ from splatam_core.config import SlamConfig
 from splatam_core.errors import ConfigError, MapFileError, SplatamError
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.maps.ply import read_ply
-from splatam_core.runs.layout import MAP
+from splatam_core.runs.layout import MAP, MAP_KEYFRAMES
+from splatam_core.runs.map_keyframes import read_map_keyframes
 from splatam_core.slam import Slam
+from splatam_core.state import NO_KEYFRAMES, SavedKeyframes
 from splatam_core.types import FrameResult, RgbdFrame, Status
+from splatam_ros.frames.buffer import TransformError
 from splatam_ros.frames.rep105 import Located, parse_pose
 from splatam_ros.frames.robot_frames import RobotFrames
 from splatam_ros.node.outputs import Outputs
@@ -62,6 +65,7 @@ class MapLifecycle:
         self._other_camera: PinholeCamera | None = None
         self._num_other = 0
         self._finish_s = 0.0
+        self._told: Matrix | None = None  # pose of the body in the map, for the next frame
 
     @property
     def folder(self) -> Path | None:
@@ -83,6 +87,19 @@ class MapLifecycle:
             self._jump_in_time(slam)
         if self._has_other_camera(slam, frame.camera):
             self.reset(slam, 'the camera changed')
+        if self._told is not None:
+            self._pass_on(slam, frame, self._told)
+            self._told = None
+
+    def _pass_on(self, slam: Slam, frame: RgbdFrame, told: Matrix) -> None:
+        """Tell SLAM where a person says that the camera of a frame is."""
+        if slam.num_gaussians == 0:
+            self._logger.warning('initialpose is refused: there is no map yet')
+            return
+        try:
+            slam.suggest(self._frames.told(frame, told, self._T_map_world))
+        except TransformError as error:
+            self._logger.warning(f'initialpose is refused: the pose of the camera in the base is not known: {error}')
 
     def record(self, frame: RgbdFrame, result: FrameResult) -> None:
         """Write a frame to disk; call before anything about it is published."""
@@ -92,7 +109,7 @@ class MapLifecycle:
         """Returns where the frame's camera is in the coordinate frames of ROS; None if it is lost or not known."""
         if result.T_world_cam is None:
             return None
-        located = self._frames.locate(frame, result.T_world_cam, self._T_map_world)
+        located = self._frames.locate(frame, result.T_world_cam, self._T_map_world, result.T_world_odom)
         if located is not None:
             self._T_map_world = located.T_map_world
         return located
@@ -158,17 +175,41 @@ class MapLifecycle:
         path = map_path(self._options.load_path)
         T_world_cam = load_pose(self._options)
         gaussians = read_ply(path)
+        saved = keyframes_beside(path) if slam.config.tracking.relocalises else NO_KEYFRAMES
         try:
             slam.check_map(gaussians)
         except SplatamError as error:
             raise MapFileError(f'{path}: {error}') from None
         self._recorder.secure(slam)
-        slam.load(gaussians, T_world_cam)
+        start = 'the camera starts at load_pose'
+        if T_world_cam is None and saved.keyframes:
+            start = 'the camera is looked for by them'
+        elif T_world_cam is None:
+            T_world_cam = np.eye(4)
+            start = (
+                'the camera starts where the map began, and cannot be found elsewhere without keyframes: publish its pose on '
+                'initialpose if it is elsewhere'
+            )
+        slam.load(gaussians, T_world_cam, saved)
         kept = self._recorder.start_over(slam, is_saved=True)
         self._begin_world()
-        message = f'loaded {len(gaussians)} Gaussians from {path}{kept}'
+        message = f'loaded {len(gaussians)} Gaussians and {len(saved.keyframes)} keyframes from {path}: {start}{kept}'
         self._logger.info(message)
         return message
+
+    def suggest(self, frame_id: str, T_map_body: Matrix) -> None:
+        """Try the next frame where a person says that the robot is; a line in the log says if it is not there.
+
+        Args:
+            frame_id: frame of the pose, which must be ``map_frame``.
+            T_map_body: [4, 4] pose of the base, or of the camera in body axes if there is no base.
+        """
+        if frame_id != self._options.map_frame:
+            self._logger.warning(
+                f"initialpose is refused: it is in the frame '{frame_id}', and must be in map_frame, '{self._options.map_frame}'"
+            )
+            return
+        self._told = T_map_body
 
     def save(self, slam: Slam) -> str:
         """Save map, trajectory and metrics in ``save_path``.
@@ -241,10 +282,20 @@ def map_path(text: str) -> Path:
     return path
 
 
-def load_pose(options: NodeOptions) -> Matrix:
-    """Returns the [4, 4] pose, camera to world, at which tracking in a loaded map starts.
+def keyframes_beside(path: Path) -> SavedKeyframes:
+    """Returns the keyframes that a run has saved beside its map; none where it saved none.
+
+    Raises:
+        CheckpointError: they cannot be read.
+    """
+    beside = path.with_name(MAP_KEYFRAMES)
+    return read_map_keyframes(beside) if path.name == MAP and beside.is_file() else NO_KEYFRAMES
+
+
+def load_pose(options: NodeOptions) -> Matrix | None:
+    """Returns the [4, 4] pose, camera to world, at which tracking in a loaded map starts; None where none is given.
 
     Raises:
         ConfigError: ``load_pose`` is not a pose.
     """
-    return parse_pose('load_pose', options.load_pose) if options.load_pose else np.eye(4)
+    return parse_pose('load_pose', options.load_pose) if options.load_pose else None

@@ -174,6 +174,8 @@ class SplatamNode(Node):
             rss_mb=provenance.rss_mb(),
             problem=self._watchdog.problem,
             camera_frame=self._frames.camera_frame(self._counters.frame_id),
+            relocalised=self._counters.relocalised,
+            graph=self._counters.graph,
         )
 
     def _use_options(self, options: NodeOptions) -> None:
@@ -224,7 +226,7 @@ class SplatamNode(Node):
 
     def _on_result(self, frame: RgbdFrame, result: FrameResult) -> None:
         self._lifecycle.record(frame, result)  # before publishing: a frame that was answered is on disk
-        self._counters.add(result, frame.frame_id)
+        self._counters.add(result, frame.frame_id, self._slam.graph.summary)
         if result.reason:
             self._warnings.warn(result.status.value, f'{result.status.value} at {stamp_text(result.stamp_ns)}: {result.reason}')
         self._outputs.publish(result, self._lifecycle.locate(frame, result), self._slam)
@@ -242,8 +244,4 @@ class SplatamNode(Node):
         is_first = result.status is Status.INITIALIZED
         if is_first or time.monotonic() - self._progress_s > PROGRESS_S:
             self._progress_s = time.monotonic()
-            self.get_logger().info(
-                f'frame {self._counters.total}: {self._counters.by_status[Status.UNCERTAIN]} uncertain and '
-                f'{self._counters.by_status[Status.LOST]} lost so far, '
-                f'{result.num_gaussians} Gaussians, {result.timings.total:.0f} ms for this frame'
-            )
+            self.get_logger().info(self._counters.progress(result))

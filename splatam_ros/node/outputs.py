@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from msg_adapters import images, point_clouds, poses, stamps
+from msg_adapters import images, markers, point_clouds, poses, stamps
 from msg_adapters.factory import MessageFactory, RclpyMessages, message_class
 from splatam_core.slam import Slam
 from splatam_core.types import FrameResult, RenderedView
@@ -138,7 +138,16 @@ def _pose_with_covariance(context: PublishContext) -> Any:
 
 
 def _path(context: PublishContext) -> Any:
-    return poses.path(context.factory, context.path.poses, context.stamp_ns, context.map_frame)
+    return poses.path(context.factory, context.path.poses(context), context.stamp_ns, context.map_frame)
+
+
+def _graph(context: PublishContext) -> Any:
+    graph, T = context.slam.graph, context.located.T_map_world
+    centres_m = graph.nodes.T_world_cam[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
+    return markers.graph(
+        context.factory, centres_m, graph.pairs(loops=False), graph.pairs(loops=True),
+        stamp_ns=context.stamp_ns, frame_id=context.map_frame,
+    )  # fmt: skip
 
 
 def _rgb(context: PublishContext) -> Any:
@@ -185,7 +194,10 @@ OUTPUTS = (
     Output('odometry', 'nav_msgs/msg/Odometry', POSE_QOS, Trigger.POSE, _odometry,
            'pose of the base (of the camera, if there is no base) in the map, with velocity and covariances; see below'),
     Output('path', 'nav_msgs/msg/Path', LATCHED_QOS, Trigger.SUBSCRIBED, _path,
-           'all tracked poses so far, thinned out evenly beyond `max_path_poses`; latched', rate_hz=_path_rate),
+           'all tracked poses so far as corrected by loops, thinned out evenly beyond `max_path_poses`; latched',
+           rate_hz=_path_rate),
+    Output('graph', 'visualization_msgs/msg/MarkerArray', LATCHED_QOS, Trigger.SUBSCRIBED, _graph,
+           'keyframes, the edges between them, and loops: places that were recognised; latched', rate_hz=_path_rate),
     Output('render/rgb', 'sensor_msgs/msg/Image', IMAGE_QOS, Trigger.SUBSCRIBED, _rgb,
            'the map rendered from the pose of the camera', rate_hz=_render_rate),
     Output('render/depth', 'sensor_msgs/msg/Image', IMAGE_QOS, Trigger.SUBSCRIBED, _depth,
@@ -198,31 +210,48 @@ OUTPUTS = (
 )  # fmt: skip
 
 
+@dataclass(slots=True, eq=False)
+class _Place:
+    """A pose of the path: the camera in the core's world as it was tracked, and as a message after the corrections so far."""
+
+    stamp_ns: int
+    T_world_cam: Matrix
+    message: Any
+
+
 class PathHistory:
-    """All poses so far, as messages. Beyond a maximum they are thinned out evenly; the newest is always included."""
+    """All poses so far. Beyond a maximum they are thinned out evenly; the newest is always included."""
 
     def __init__(self, max_poses: int) -> None:
         self._max_poses = max_poses
         self._stride = 1
         self._count = 0
-        self._kept: list[Any] = []
-        self._newest: Any = None
+        self._kept: list[_Place] = []
+        self._newest: _Place | None = None
+        self._num_corrections = 0
 
-    def append(self, pose: Any) -> None:
+    def append(self, stamp_ns: int, T_world_cam: Matrix, message: Any) -> None:
         """Add a pose."""
-        self._newest = pose
+        self._newest = _Place(stamp_ns, T_world_cam, message)
         if self._count % self._stride == 0:
-            self._kept.append(pose)
+            self._kept.append(self._newest)
         self._count += 1
         if len(self._kept) >= self._max_poses:  # ``poses`` may add the newest
             self._kept = self._kept[::2]
             self._stride *= 2
 
-    @property
-    def poses(self) -> list[Any]:
-        """The poses, in order."""
-        ends_with_newest = self._newest is None or (self._kept and self._kept[-1] is self._newest)
-        return list(self._kept) if ends_with_newest else [*self._kept, self._newest]
+    def poses(self, context: PublishContext) -> list[Any]:
+        """Returns the poses as messages, in order, as the graph of ``context.slam`` corrects them."""
+        is_last = self._newest is None or (self._kept and self._kept[-1] is self._newest)
+        places = list(self._kept) if is_last or self._newest is None else [*self._kept, self._newest]
+        graph = context.slam.graph
+        if places and graph.num_corrections != self._num_corrections:
+            stamps_ns, tracked = np.array([place.stamp_ns for place in places]), np.array([place.T_world_cam for place in places])
+            for place, T_world_cam in zip(places, graph.corrected(stamps_ns, tracked)):
+                T_map_cam = context.located.T_map_world @ T_world_cam
+                place.message = poses.pose_stamped(context.factory, T_map_cam, place.stamp_ns, context.map_frame)
+            self._num_corrections = graph.num_corrections
+        return [place.message for place in places]
 
 
 class Outputs:
@@ -279,9 +308,9 @@ class Outputs:
             located: its camera in the coordinate frames of ROS; None if that is not known.
             slam: SLAM in its state after the frame.
         """
-        if result.T_world_cam is None:
+        if result.T_world_cam is None or result.is_relocalised:
             self._motion.interrupt()
-        elif located is not None and self._node.context.ok():
+        if result.T_world_cam is not None and located is not None and self._node.context.ok():
             self._publish_pose(located, result.T_world_cam, result, slam)
         if not result.status.is_trusted and self._node.context.ok():
             self._frames.hold(result.stamp_ns)
@@ -322,7 +351,7 @@ class Outputs:
             self._publish_due(context, [row for row in self._publishers if row[0].trigger is Trigger.POSE])
             return
         self._newest = context
-        self._path.append(context.pose)
+        self._path.append(context.stamp_ns, T_world_cam, context.pose)
         self._frames.publish(located)
         self._publish_due(context, self._publishers)
         self.num_poses += 1

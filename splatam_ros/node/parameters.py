@@ -54,7 +54,8 @@ NODE_SETTINGS: tuple[Setting, ...] = (
         '(exit_on_publisher_end) has no limit.', 's', 0.1,
     ),
     _setting('load_path', '', 'Map to load at start and on ~/load_map: a .ply file, or the folder of a run.'),
-    _setting('load_pose', '', 'Pose of the camera in the loaded map: x y z qx qy qz qw; empty = where the map began.', 'm'),
+    _setting('load_pose', '', 'Pose of the camera in the loaded map: x y z qx qy qz qw; empty = look for it by the keyframes '
+             'beside the map (map.keyframes), or without them start where the map began.', 'm'),
     _setting('width', 0, 'Resize frames to this width. Decrease for speed. 0 = keep the size.', 'px', 0, 16384),
     _setting('map_frame', 'map', 'Coordinate frame of poses and map.'),
     _setting('odom_frame', 'odom', 'Coordinate frame between map and base; empty = base is a child of map.'),

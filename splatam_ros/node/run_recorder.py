@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,7 +12,10 @@ from rclpy.impl.rcutils_logger import RcutilsLogger
 
 from splatam_core.config import SlamConfig
 from splatam_core.errors import ConfigError, RunFolderError, SplatamError
+from splatam_core.graph.keyframe_graph import KeyframeGraph
+from splatam_core.graph.places import Places
 from splatam_core.mapping.gaussian_map import GaussianMap
+from splatam_core.mapping.posed import PosedView
 from splatam_core.runs.metrics import Metrics
 from splatam_core.runs.record import RunDescription
 from splatam_core.runs.writer import RunFolder
@@ -33,12 +37,18 @@ class Waiting:
     Attributes:
         config: the settings of its end.
         map: its map.
+        keyframes: of the map.
+        places: of the keyframes.
+        graph: of its keyframes.
         is_saved: True once the map is on the disk.
         frames: the frames since then, without their images.
     """
 
     config: SlamConfig
     map: GaussianMap
+    keyframes: Sequence[PosedView]
+    places: Places
+    graph: KeyframeGraph
     is_saved: bool
     frames: list[tuple[RgbdFrame, FrameResult]] = field(default_factory=list)
 
@@ -181,7 +191,7 @@ class RunRecorder:
                 self._logger.error(f'{self._folder.path}: {len(self._waiting.frames)} frames of the run so far are lost: no room')
             self._waiting.frames.clear()
         elif not self._folder.is_empty:
-            self._waiting = Waiting(slam.config, slam.map, is_saved)
+            self._waiting = Waiting(slam.config, slam.map, slam.keyframes, slam.places, slam.graph, is_saved)
         return f'; the run so far is in {self._folder.path / "previous"}' if self._ends_run(at_once=True) else ''
 
     def _ends_run(self, *, at_once: bool = False) -> bool:

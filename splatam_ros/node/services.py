@@ -11,11 +11,12 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from splatam_core.errors import SplatamError
+from splatam_core.errors import ConfigError, SplatamError
 from splatam_core.slam import Slam
 from splatam_core.worker import SlamWorker
 from splatam_ros.node.attempt import why
 from splatam_ros.node.gate import FrameGate
+from splatam_ros.node.initial_pose import InitialPose
 from splatam_ros.node.map_lifecycle import MapLifecycle
 
 
@@ -37,7 +38,12 @@ SERVICES = (
     Service('pause', 'drop frames until `~/resume`; the map does not change'),
     Service('resume', 'process frames again, starting from the last pose'),
     Service('save_map', 'save map, trajectory and metrics in `save_path`; each file is replaced atomically'),
-    Service('load_map', 'continue in the map at `load_path` from `load_pose`; with `slam.mapping.enabled` off only localize'),
+    Service('optimize', 'make poses and map agree best with all that the keyframe graph has measured, now rather than at the end'),
+    Service(
+        'load_map',
+        'continue in the map at `load_path` from `load_pose`, or without it wherever the camera recognises a keyframe of the '
+        'map; with `slam.mapping.enabled` off only localize',
+    ),
 )
 
 
@@ -55,7 +61,10 @@ class FinishedCall(Protocol):
 
 
 class Services:
-    """Serves ``SERVICES``. A failure is answered with ``success`` false and the reason; it never ends the node."""
+    """Serves ``SERVICES``, and listens to ``initialpose``.
+
+    A failure is answered with ``success`` false and the reason; it never ends the node.
+    """
 
     def __init__(self, node: Node, worker: SlamWorker, lifecycle: MapLifecycle, gate: FrameGate) -> None:
         self._node = node
@@ -67,10 +76,12 @@ class Services:
             'pause': self._pause,
             'resume': self._resume,
             'save_map': self._save_map,
+            'optimize': self._optimize,
             'load_map': self._load_map,
         }
         for service in SERVICES:
             node.create_service(Trigger, f'~/{service.name}', _handler(actions[service.name]))
+        self._initial_pose = InitialPose(node, worker, lifecycle)
 
     async def _reset(self) -> Trigger.Response:
         return await self._on_worker(self._reset_slam)
@@ -88,6 +99,9 @@ class Services:
 
     async def _save_map(self) -> Trigger.Response:
         return await self._on_worker(self._lifecycle.save)
+
+    async def _optimize(self) -> Trigger.Response:
+        return await self._on_worker(_optimize)
 
     async def _load_map(self) -> Trigger.Response:
         return await self._on_worker(self._lifecycle.load)
@@ -129,6 +143,14 @@ def _handler(action: Callable[[], Awaitable[Trigger.Response]]) -> Callable[...,
 def _rest(slam: Slam) -> str:
     slam.rest()
     return 'resumed'
+
+
+def _optimize(slam: Slam) -> str:
+    graph = slam.graph
+    if not graph.is_used:
+        raise ConfigError('there is no keyframe graph: set slam.graph.enabled to true')
+    moved_m = slam.optimize_graph()
+    return f'{len(graph.nodes)} keyframes with {graph.num_loops} loops: corrected by at most {100 * moved_m:.1f} cm'
 
 
 def _succeeded(message: str) -> Trigger.Response:

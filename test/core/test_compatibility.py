@@ -32,7 +32,12 @@ def splatam(*words: object) -> int:
 
 
 PRESET_THEN: dict[str, dict[str, object]] = {
-    'realtime': {'densification.depth_noise_ratio': 0.0, 'tracking.silhouette_threshold': 0.99, 'mapping.max_gaussians': 0}
+    'realtime': {
+        'densification.depth_noise_ratio': 0.0,
+        'tracking.silhouette_threshold': 0.99,
+        'mapping.max_gaussians': 0,
+        'tracking.align.relocalisation.enabled': False,
+    }
 }
 
 

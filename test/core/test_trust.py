@@ -136,7 +136,7 @@ def test_what_a_wrong_pose_has_added_is_removed(off_m: float, room: list[RgbdFra
     add_at(slam, room[6], results[-1].T_world_cam @ se3.exp(np.array([0, off_m, off_m, 0, 0, 0])), index=6)
     added, keyframes = slam.num_gaussians - len(before.means), [keyframe.frame for keyframe in slam._mapper.keyframes]
     assert added > (100 if off_m else 0) and keyframes == [0, 5, 6]
-    removed = correct(slam._mapper, slam._tracker, slam.config.tracking, current=8)
+    removed = correct(slam._mapper, slam.graph, slam._tracker, slam.config.tracking, current=8)
     assert removed == (added if off_m else 0)
     if off_m:
         assert np.array_equal(slam.snapshot().means, before.means)

@@ -16,6 +16,8 @@ from msg_adapters.synchronizer import RgbdSet, RgbdSynchronizer
 from splatam_core.config import KeyframeConfig, load_config
 from splatam_core.errors import FrameError
 from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.graph.keyframe_graph import KeyframeGraph
+from splatam_core.graph.places import Places
 from splatam_core.images.view import View
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.keyframes import KeyframeStore
@@ -164,7 +166,7 @@ def test_keyframes_of_a_long_way_are_bounded() -> None:
 
 
 def test_what_waits_for_a_full_disk_is_bounded() -> None:
-    waiting = Waiting(load_config('quick'), GaussianMap(), is_saved=False)
+    waiting = Waiting(load_config('quick'), GaussianMap(), (), Places(), KeyframeGraph(load_config('quick'), None), is_saved=False)
     camera = PinholeCamera(64, 48, 55.0, 55.0, 31.5, 23.5)
     frame = RgbdFrame(10**18, np.zeros((48, 64, 3), np.uint8), np.ones((48, 64), np.float32), camera)
     result = FrameResult(0, 10**18, Status.LOST, None, False, 9, 1.0, 1.0, '', StageTimings())

@@ -36,7 +36,9 @@ class Calls:
 class Frames(Calls):
     """Locates every camera, at the given or else at a new map."""
 
-    def locate(self, frame: RgbdFrame, T_world_cam: np.ndarray, T_map_world: np.ndarray | None) -> Located:
+    def locate(
+        self, frame: RgbdFrame, T_world_cam: np.ndarray, T_map_world: np.ndarray | None, T_world_odom: np.ndarray
+    ) -> Located:
         self.calls.append('new map' if T_map_world is None else 'same map')
         T = T_MAP_WORLD if T_map_world is None else T_map_world
         return Located(frame.stamp_ns, frame.frame_id, frame.frame_id, T, T @ T_world_cam, T @ T_world_cam, None)

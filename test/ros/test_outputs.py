@@ -404,6 +404,7 @@ def test_what_was_recorded_of_the_node_plays_back(graph: Graph, tf_message: type
 SHOWS = {
     'rviz_default_plugins/PointCloud2': 'sensor_msgs/msg/PointCloud2',
     'rviz_default_plugins/Path': 'nav_msgs/msg/Path',
+    'rviz_default_plugins/MarkerArray': 'visualization_msgs/msg/MarkerArray',
     'rviz_default_plugins/Pose': 'geometry_msgs/msg/PoseStamped',
     'rviz_default_plugins/Odometry': 'nav_msgs/msg/Odometry',
     'rviz_default_plugins/Image': 'sensor_msgs/msg/Image',

@@ -83,6 +83,7 @@ DESCRIPTIONS: dict[str, Sequence[Description]] = {
         Description('tracked', 'tracked', '', 1, ',d', 'Frames with a pose that may be trusted, including the first.'),
         Description('uncertain', 'uncertain', '', 1, ',d', 'Frames with a pose that may be wrong; they are not mapped.'),
         Description('lost', 'lost', '', 1, ',d', 'Frames without a pose; they do not change the map.'),
+        Description('relocalised', 'relocalised', '', 1, ',d', 'Times that a lost camera was found anew, anywhere in the map.'),
         Description('fps', 'speed', 'fps', 1, '.2f', 'Frames divided by the time spent in SLAM, without decoding.'),
         Description(
             'fps_with_io', 'speed with decoding', 'fps', 1, '.2f',
@@ -101,6 +102,12 @@ DESCRIPTIONS: dict[str, Sequence[Description]] = {
             'ate_rmse_m', 'ATE RMSE', 'cm', 100, '.3f',
             'Root mean squared distance of the camera centres after rigid alignment.',
         ),
+        Description(
+            'ate_final_rmse_m', 'ATE RMSE, final', 'cm', 100, '.3f',
+            'The same after all corrections of the keyframe graph: where the frames are in the final map.',
+        ),
+        Description('loops', 'loops', '', 1, ',d', 'Places that were recognised as seen before.'),
+        Description('corrections', 'corrections', '', 1, ',d', 'Times that poses and map were corrected by loops.'),
         Description(
             'ate_frames', 'frames with ground truth', '', 1, ',d',
             'Frames with a pose, tracked and uncertain, that the ATE is computed from.',

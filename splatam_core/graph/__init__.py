@@ -1,0 +1,1 @@
+"""Keyframes as places: they are recognised, joined by a graph, and moved together with what they have mapped."""

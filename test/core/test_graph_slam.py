@@ -1,0 +1,80 @@
+"""Slam with a keyframe graph: corrections move map, keyframes and tracking together, and a state holds all of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from splatam_core.config import load_config
+from splatam_core.datasets.registry import open_sequence
+from splatam_core.geometry import se3
+from splatam_core.slam import Slam
+from splatam_core.types import FrameResult, RgbdFrame, Status
+
+OVERRIDES = ('threads=1', 'keyframes.every=2', 'mapping.iterations=3', 'graph.loop_after=8', 'graph.min_correction_m=0')
+
+
+@pytest.fixture(scope='module')
+def there_and_back() -> list[RgbdFrame]:
+    """Eleven frames of the room, then the same backwards."""
+    sequence = open_sequence('synthetic', width=96, max_frames=11)
+    frames = [sequence[index] for index in range(11)]
+    return [replace(frame, stamp_ns=10**9 + number * 33_333_333) for number, frame in enumerate([*frames, *frames[-2::-1]])]
+
+
+def slam_with(*overrides: str) -> Slam:
+    return Slam(load_config('realtime', [*OVERRIDES, *overrides]))
+
+
+@pytest.fixture(scope='module')
+def run(there_and_back: list[RgbdFrame]) -> tuple[Slam, list[FrameResult], Slam]:
+    """The whole, its results, and another Slam that went on from a state in the middle."""
+    slam, other = slam_with('graph.enabled=true'), slam_with('graph.enabled=true')
+    results = [slam.process(frame) for frame in there_and_back[:15]]
+    other.restore(slam.state())
+    results += [slam.process(frame) for frame in there_and_back[15:]]
+    for frame in there_and_back[15:]:
+        other.process(frame)
+    return slam, results, other
+
+
+def test_corrections_move_everything_together(run: tuple[Slam, list[FrameResult], Slam]) -> None:
+    slam, results, _ = run
+    assert {result.status for result in results[1:]} == {Status.TRACKED}
+    summary = slam.graph.summary
+    assert summary.nodes >= 11 and summary.loops > 0 and summary.corrections > 0
+    placed = np.array([se3.inverse(keyframe.T_cam_world.double().numpy()) for keyframe in slam._mapper.keyframes])
+    is_keyframe = np.isin(slam.graph.nodes.frames, [keyframe.frame for keyframe in slam._mapper.keyframes])
+    np.testing.assert_allclose(placed, slam.graph.nodes.T_world_cam[is_keyframe], atol=1e-5)  # float32
+    steps = [se3.inverse(result.T_world_odom) @ result.T_world_cam for result in results]
+    jumps = [np.linalg.norm((se3.inverse(a) @ b)[:3, 3]) for a, b in pairwise(steps)]
+    assert max(jumps) < 0.05  # odometry: the camera moves by less than 2 cm per frame
+    assert not (results[-1].T_world_odom == np.eye(4)).all()
+
+
+def test_a_state_holds_the_graph(run: tuple[Slam, list[FrameResult], Slam]) -> None:
+    first, second = run[0].state(), run[2].state()
+    for one, other in ((first.graph, second.graph), (first.map, second.map)):
+        assert one.keys() == other.keys()
+        assert all(np.array_equal(one[name], other[name]) for name in one)
+    assert (first.motion.T_world_cam == second.motion.T_world_cam).all()
+
+
+def test_final_poses_are_those_in_the_final_map(run: tuple[Slam, list[FrameResult], Slam]) -> None:
+    """The last pose and the poses of keyframes are where the graph has them; the first never moves."""
+    slam, results, _ = run
+    stamps_ns = np.array([result.stamp_ns for result in results])
+    final = slam.graph.corrected(stamps_ns, np.array([result.T_world_cam for result in results]))
+    np.testing.assert_allclose(final[slam.graph.nodes.frames], slam.graph.nodes.T_world_cam, atol=1e-9)
+    assert (final[0] == np.eye(4)).all()
+
+
+def test_without_a_graph_nothing_is_kept(there_and_back: list[RgbdFrame]) -> None:
+    slam = slam_with('graph.enabled=false')
+    results = [slam.process(frame) for frame in there_and_back[:4]]
+    assert slam.graph.summary.nodes == 0 and slam.optimize_graph() == 0
+    poses = np.array([result.T_world_cam for result in results])
+    assert (slam.graph.corrected(np.array([result.stamp_ns for result in results]), poses) == poses).all()

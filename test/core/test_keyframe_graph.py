@@ -1,0 +1,153 @@
+"""The keyframe graph: loops correct drift, wrong ones do not, and it stays small. Pairs are measured from true poses here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from splatam_core.config import load_config
+from splatam_core.geometry import motions, se3
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.graph.keyframe_graph import KeyframeGraph, TrackedFrame
+from splatam_core.graph.pairs import PairResult
+from splatam_core.images.view import View
+from splatam_core.mapping.posed import PosedView
+from splatam_core.tracking.evidence import Evidence
+from splatam_core.tracking.torch_aligner import TorchAligner
+
+CAMERA = PinholeCamera(32, 24, 30.0, 30.0, 15.5, 11.5)
+EVERY = 5  # frames
+DRIFT = np.array([0.002, 0.001, 0, 0, 0.0005, 0])  # per keyframe: 8 cm there and back
+CONFIG = load_config('realtime', ['graph.enabled=true', 'graph.loop_after=50'])
+
+
+def there_and_back(count: int) -> np.ndarray:
+    """True poses: sideways for half of the keyframes, then back the same way."""
+    way = 0.05 * np.minimum(np.arange(count), count - 1 - np.arange(count))
+    return motions.exp(way[:, None] * np.array([1, 0, 0, 0, 0.1, 0.0]))
+
+
+class TruePairs:
+    """Measures pairs of views by their true poses, with noise of a millimetre."""
+
+    def __init__(self, truth: np.ndarray, wrong: np.ndarray | None = None) -> None:
+        self.truth, self.numbers, self.wrong, self.rng = truth, {}, wrong, np.random.default_rng(0)
+
+    def align(self, first: View, second: View, T_second_first: np.ndarray) -> PairResult:
+        i, j = self.numbers[first], self.numbers[second]
+        T = motions.between(self.truth[j], self.truth[i]) @ se3.exp(0.001 * self.rng.standard_normal(6))
+        if self.wrong is not None and j - i > 4:
+            T = self.wrong @ T
+        return PairResult(T, 0.8, 0.99, lambda: Evidence(1e-6 * np.eye(6), 0, 1.0, 48, 0.01))
+
+    def way_back(self, first: View, second: View, there: PairResult) -> tuple[float, float]:
+        return 0.0, 0.0
+
+
+class Drifting:
+    """A camera that tracks with drift, in the corrected map, and its keyframes."""
+
+    def __init__(self, truth: np.ndarray, wrong: np.ndarray | None = None, budget: int = 0) -> None:
+        self.graph = KeyframeGraph(CONFIG, TorchAligner())
+        self.pairs = self.graph._pairs = TruePairs(truth, wrong)
+        self.truth, self.budget, self.keyframes, self.published, self.where = truth, budget, [], [], np.eye(4)
+
+    def run(self, begin: int = 0, end: int | None = None) -> Drifting:
+        for number in range(begin, len(self.truth) if end is None else end):
+            if number:
+                self.where = self.where @ motions.between(self.truth[number - 1], self.truth[number]) @ se3.exp(DRIFT)
+            view = View(CAMERA, torch.zeros(24, 32, 3, dtype=torch.uint8), torch.full((24, 32), 2.0))
+            self.pairs.numbers[view] = number
+            self.published.append(self.where)
+            self.keyframes.append(PosedView.at(view, se3.inverse(self.where), EVERY * number))
+            if self.budget and len(self.keyframes) > self.budget:
+                del self.keyframes[1 + number % (self.budget - 2)]
+            for after in range(3):  # the camera rests for two frames after each keyframe
+                frame = TrackedFrame(EVERY * number + after, 10 * number + after, self.where, np.zeros((6, 6)))
+                corrections = self.graph.follow(frame, self.keyframes)
+                if corrections is None:
+                    continue
+                moved = corrections.at(np.array([keyframe.frame for keyframe in self.keyframes]))
+                before = [keyframe.T_cam_world.double().numpy() for keyframe in self.keyframes]
+                placed = [T @ se3.inverse(motion) for T, motion in zip(before, moved)]
+                self.keyframes = [PosedView.at(old.view, T, old.frame) for old, T in zip(self.keyframes, placed)]
+                self.where = corrections.motions[-1] @ self.where
+        return self
+
+    def errors_m(self) -> np.ndarray:
+        """How far the final poses are from the truth."""
+        final = self.graph.corrected(10 * np.arange(len(self.published)), np.array(self.published))
+        return np.linalg.norm(final[:, :3, 3] - self.truth[: len(final), :3, 3], axis=1)
+
+
+def test_loops_take_drift_back() -> None:
+    truth = there_and_back(60)
+    camera = Drifting(truth).run()
+    without = np.linalg.norm(np.array(camera.published)[:, :3, 3] - truth[:, :3, 3], axis=1)
+    assert camera.graph.num_loops > 5 and camera.graph.num_corrections >= 1
+    assert camera.errors_m().max() < 0.05 and camera.errors_m()[-1] < 0.03 < 0.1 < 60 * np.linalg.norm(DRIFT[:3])
+    assert without.max() < 0.1  # published poses profit from the corrections as well
+    np.testing.assert_allclose(camera.graph.T_world_odom[:3, :3] @ camera.graph.T_world_odom[:3, :3].T, np.eye(3), atol=1e-9)
+
+
+def test_a_wrong_loop_changes_nothing() -> None:
+    """Half a metre off, where odometry and pairs know better."""
+    camera = Drifting(there_and_back(40), wrong=se3.exp(np.array([0.5, 0, 0, 0, 0.3, 0]))).run()
+    assert camera.graph.num_loops == camera.graph.num_corrections == 0
+    assert (camera.graph.T_world_odom == np.eye(4)).all()
+
+
+def test_what_agrees_is_left_alone() -> None:
+    camera = Drifting(there_and_back(60))
+    camera.graph.configure(replace(CONFIG, graph=replace(CONFIG.graph, min_correction_m=1.0)))
+    camera.graph._pairs = camera.pairs
+    camera.run()
+    assert camera.graph.num_loops > 5 and camera.graph.num_corrections == 0
+    assert (camera.graph.nodes.T_world_cam == np.array(camera.published)).all()
+
+
+def test_dropped_keyframes_leave_the_graph_small() -> None:
+    """An hour of new space with a budget: edges stay few, every keyframe keeps its pose, and loops still correct."""
+    camera = Drifting(there_and_back(200), budget=30).run()
+    assert len(camera.graph.nodes) >= 200  # and the frames at which something was corrected
+    assert len(camera.graph._active) <= 32
+    assert len(camera.graph._links) < 20 * 32
+    assert camera.errors_m()[-1] < 0.08 < 200 * np.linalg.norm(DRIFT[:3])
+
+
+def test_a_state_continues_bit_for_bit() -> None:
+    truth = there_and_back(50)
+    half = Drifting(truth).run(end=40)
+    other = Drifting(truth)
+    other.graph.restore(half.graph.arrays())
+    other.pairs.numbers, other.pairs.rng = dict(half.pairs.numbers), half.pairs.rng
+    other.keyframes, other.published, other.where = list(half.keyframes), list(half.published), half.where
+    rng = half.pairs.rng.bit_generator.state
+    half.run(begin=40)
+    other.pairs.rng.bit_generator.state = rng
+    other.run(begin=40)
+    first, second = half.graph.arrays(), other.graph.arrays()
+    assert first.keys() == second.keys()
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+
+
+def test_a_state_that_is_none_is_refused() -> None:
+    arrays = Drifting(there_and_back(10)).run().graph.arrays()
+    faults = {
+        'pairs': None, 'T_first_second': np.full_like(arrays['T_first_second'], np.nan), 'placed': arrays['placed'][1:],
+        'active': arrays['active'] + 1,
+    }  # fmt: skip
+    for name, value in faults.items():
+        broken = {key: array for key, array in {**arrays, name: value}.items() if array is not None}
+        with pytest.raises(ValueError, match=name):
+            KeyframeGraph(CONFIG, None).restore(broken)
+
+
+def test_what_is_taken_back_leaves_the_graph() -> None:
+    camera = Drifting(there_and_back(30)).run()
+    camera.graph.drop_from(EVERY * 20)
+    assert camera.graph.nodes.frames[-1] < EVERY * 20 and camera.graph.pairs(loops=False).max() == len(camera.graph.nodes) - 1
+    assert max(camera.graph._active) == len(camera.graph.nodes) - 1

@@ -1,0 +1,92 @@
+"""A correction of the map by a loop, as robots see it: map to odom jumps, odom to base never does, and the path follows."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from msg_adapters import markers, poses
+from msg_adapters.factory import RclpyMessages
+from splatam_core.geometry import motions, se3
+from splatam_core.graph.nodes import Nodes
+from splatam_core.types import FrameResult, StageTimings, Status
+from splatam_ros.frames.buffer import TransformBuffer
+from splatam_ros.frames.covariance import MotionEstimator
+from splatam_ros.frames.rep105 import CoordinateFrames, Located
+from splatam_ros.node.outputs import PathHistory
+from splatam_ros.node.parameters import node_options
+
+JUMP = se3.exp(np.array([0.2, 0, 0.1, 0, 0.1, 0]))
+STEP = se3.exp(np.array([0.01, 0, 0, 0, 0.02, 0]))
+SECOND_NS = 10**9
+
+
+class NoWarnings:
+    """Fails the test where something warns."""
+
+    def warn(self, kind: str, text: str) -> None:
+        raise AssertionError(text)
+
+
+def located(number: int, *, is_corrected: bool) -> Located:
+    """The camera after some steps; corrected, its pose in the world has jumped."""
+    frames = CoordinateFrames(node_options({}).frames, TransformBuffer(), NoWarnings())  # type: ignore[arg-type]
+    T_world_odom = JUMP if is_corrected else np.eye(4)
+    T = T_world_odom @ np.linalg.matrix_power(STEP, number)
+    found = frames.locate(number * SECOND_NS, 'camera', T, np.eye(4), T_world_odom)
+    assert found is not None
+    return found
+
+
+def test_odometry_stays_continuous() -> None:
+    frames = CoordinateFrames(node_options({}).frames, TransformBuffer(), NoWarnings())  # type: ignore[arg-type]
+    before, after = (frames.moving(located(number, is_corrected=number > 3)) for number in (3, 4))
+    assert (before['map', 'odom'] == np.eye(4)).all()
+    np.testing.assert_allclose(after['map', 'odom'], JUMP, atol=1e-12)
+    for moving, number in ((before, 3), (after, 4)):
+        np.testing.assert_allclose(moving['odom', 'camera'], np.linalg.matrix_power(STEP, number), atol=1e-12)
+
+
+def test_velocity_is_without_the_jump() -> None:
+    estimator, twists = MotionEstimator(0.01, 0.01), []
+    for number in range(2, 6):
+        result = FrameResult(number, number * SECOND_NS, Status.TRACKED, np.eye(4), False, 9, 1.0, 1.0, '', StageTimings())
+        twists.append(estimator.observe(located(number, is_corrected=number > 3), result).twist)
+    for twist in twists[1:]:
+        np.testing.assert_allclose(twist, se3.log(STEP), atol=1e-9)
+
+
+def corrected_graph() -> SimpleNamespace:
+    """Two keyframes, of which the second was corrected when it was added."""
+    nodes = Nodes().added(0, 0, np.eye(4)).added(2, 2 * SECOND_NS, np.linalg.matrix_power(STEP, 2))
+    nodes = nodes.moved(np.array([np.eye(4), JUMP @ nodes.T_world_cam[1]]))
+    return SimpleNamespace(num_corrections=1, corrected=nodes.corrected)
+
+
+@pytest.mark.parametrize('is_corrected', [False, True])
+def test_the_path_follows(is_corrected: bool) -> None:
+    factory, path = RclpyMessages(), PathHistory(100)
+    for number in range(3):
+        T = np.linalg.matrix_power(STEP, number)
+        path.append(number * SECOND_NS, T, poses.pose_stamped(factory, T, number * SECOND_NS, 'map'))
+    graph = corrected_graph() if is_corrected else SimpleNamespace(num_corrections=0)
+    context: Any = SimpleNamespace(
+        slam=SimpleNamespace(graph=graph), located=located(2, is_corrected=False), factory=factory, map_frame='map'
+    )
+    shown = [poses.pose_matrix(message.pose) for message in path.poses(context)]
+    last = JUMP @ np.linalg.matrix_power(STEP, 2) if is_corrected else np.linalg.matrix_power(STEP, 2)
+    np.testing.assert_allclose(shown[2], last, atol=1e-9)
+    np.testing.assert_allclose(shown[0], np.eye(4), atol=1e-9)
+
+
+def test_a_graph_is_three_markers() -> None:
+    centres = motions.exp(np.arange(3)[:, None] * np.array([1.0, 0, 0, 0, 0, 0]))[:, :3, 3]
+    edges, loops = np.array([(0, 1), (1, 2)]), np.array([(0, 2)])
+    message = markers.graph(RclpyMessages(), centres, edges, loops, stamp_ns=5, frame_id='map')
+    assert [marker.ns for marker in message.markers] == ['keyframes', 'edges', 'loops']
+    assert [len(marker.points) for marker in message.markers] == [3, 4, 2]
+    assert [point.x for point in message.markers[2].points] == [0.0, 2.0]
+    assert {marker.header.frame_id for marker in message.markers} == {'map'}
