@@ -2,8 +2,9 @@
 
     python benchmarks/holes.py [RECORDING ...] [--preset realtime] [--width 320] [--runs 3] [--max-frames N] [--ratio 2 3]
 
-RECORDING is a folder in SPLATAM_DATA, or ``synthetic``. Run k has seed k and one thread. Images are scored at the estimated poses
-against the depth without holes; closed is the fraction of its readings where the map's silhouette is at least 0.5.
+RECORDING is a folder in SPLATAM_DATA, or ``synthetic``, of which run k is in room k. Run k has seed k and one thread. Images are
+scored at the estimated poses against the depth without holes; closed is the fraction of its readings where the map's silhouette is
+at least 0.5.
 """
 
 from __future__ import annotations
@@ -115,11 +116,11 @@ def main() -> None:
     print_header(f'Preset `{args.preset}`, width {args.width}, one thread', args.runs)
     print('| ' + ' | '.join(COLUMNS) + ' |\n|' + '---|' * len(COLUMNS))
     for name in args.recordings:
-        source = name if name.startswith('synthetic') else str(DATA / name)
-        dense = open_sequence(source, width=args.width, max_frames=args.max_frames)
+        sources = [f'synthetic:seed={seed}' if name == 'synthetic' else str(DATA / name) for seed in range(args.runs)]
+        dense = [open_sequence(source, width=args.width, max_frames=args.max_frames) for source in sources]
         for ratio in args.ratio:
-            given = dense if ratio == 1 else ThinnedSequence(dense, ratio, args.bent)
-            outcomes = [run(dense, given, args, seed) for seed in range(args.runs)]
+            given = dense if ratio == 1 else [ThinnedSequence(each, ratio, args.bent) for each in dense]
+            outcomes = [run(*sequences, args, seed) for seed, sequences in enumerate(zip(dense, given, strict=True))]
             bent = ', bent' if args.bent else ''
             print(row(name, 'dense' if ratio == 1 else f'1/{ratio:g}{bent}', outcomes), flush=True)
 

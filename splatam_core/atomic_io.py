@@ -36,6 +36,7 @@ def new_folder(path: Path) -> Iterator[Path]:
         OSError: it cannot be made, or something other than an empty folder is at the path in the end.
     """
     temporary = path.with_name(f'.{path.name}.{os.getpid()}')
+    shutil.rmtree(temporary, ignore_errors=True)  # in containers a process often has the number of one that was killed
     temporary.mkdir(parents=True)
     try:
         yield temporary

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 import logging
+import signal
 import sys
 from collections.abc import Sequence
 
 from splatam_core.commands import ablations, bench, compare, convert, evaluate, export, lpips_weights, refine, render, run
 from splatam_core.commands.shared import EXIT_ERROR, EXIT_INTERRUPTED
 from splatam_core.errors import SplatamError, one_line
+from splatam_core.interruption import on_stop_signals
+from splatam_core.output import unfailing_output
 
 COMMANDS = (
     run.COMMAND,
@@ -34,12 +37,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit code.
     """
-    args = make_parser().parse_args(arguments)
+    with unfailing_output():
+        return _main(make_parser().parse_args(arguments))
+
+
+def _main(args: argparse.Namespace) -> int:
+    """Runs a command. Returns the exit code."""
     handler = logging.StreamHandler()
     handler.addFilter(_Once())
     logging.basicConfig(level=logging.WARNING, format='splatam: %(levelname)s: %(message)s', handlers=[handler])
     try:
-        return args.run(args)
+        with on_stop_signals(signal.default_int_handler):
+            return args.run(args)
     except SplatamError as error:
         print(f'splatam: error: {error}', file=sys.stderr)
         return EXIT_ERROR

@@ -1,13 +1,39 @@
-"""Ends a long frame early, between two of its steps, when there is no time left for it."""
+"""Being told to stop: the signals that ask for it, and how a long frame ends early, between two of its steps."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
 
 from splatam_core.errors import FrameError
 
 Stop = Callable[[], bool]
 """Asked before each step; no further step is taken once it returns True."""
+
+
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Ctrl-C, the end of a service or a container, and the end of the terminal or of an ssh connection."""
+
+
+@contextmanager
+def on_stop_signals(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Calls a handler on each signal that asks to stop. ``nohup`` keeps its meaning: SIGHUP is ignored then.
+
+    Python takes handlers from the main thread only; in another one, nothing changes.
+    """
+    is_nohup = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    numbers = [number for number in STOP_SIGNALS if not (is_nohup and number is signal.SIGHUP)]
+    previous = {}
+    with suppress(ValueError):
+        for number in numbers:
+            previous[number] = signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, before in previous.items():
+            signal.signal(number, before)
 
 
 def never() -> bool:

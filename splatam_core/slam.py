@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 
 from splatam_core.correction import correct
+from splatam_core.errors import FrameError
 from splatam_core.geometry import se3
 from splatam_core.graph.relocalisation import unknown
 from splatam_core.images.observation import Observation
@@ -17,6 +21,19 @@ from splatam_core.tracking.verdict import Verdict
 from splatam_core.types import FrameResult, RgbdFrame, Status
 
 MIN_SIDE = 8  # pixels
+
+
+@contextmanager
+def _solvable() -> Iterator[None]:
+    """Makes a view so odd that rounding leaves no system of equations to solve cost only itself.
+
+    Raises:
+        FrameError: it is.
+    """
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        raise FrameError(f'it cannot be tracked: {error}; is the calibration that of the camera?') from None
 
 
 class Slam(SlamLifecycle):
@@ -36,8 +53,9 @@ class Slam(SlamLifecycle):
             return self._initialize(current, seen)
 
         view = seen.device.scaled(self.config.tracking.scale)
-        tracked, verdict = self._find(view, self._motion.predictions(frame.stamp_ns))
-        found = self._relocaliser.recover(self._sight(seen, view, frame.stamp_ns), tracked, verdict)
+        with _solvable():
+            tracked, verdict = self._find(view, self._motion.predictions(frame.stamp_ns))
+            found = self._relocaliser.recover(self._sight(seen, view, frame.stamp_ns), tracked, verdict)
         if found is not None:
             tracked, verdict = found.result, self._judge.relocate(found.judge, found.verdict)
             self._motion.place(found.T_world_cam)

@@ -14,6 +14,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.signals import SignalHandlerOptions
 
 from splatam_core.errors import SplatamError
+from splatam_core.interruption import on_stop_signals
 from splatam_core.resources import config_dir
 
 PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
@@ -24,18 +25,16 @@ class RosError(SplatamError):
 
 
 class StopRequest:
-    """Turns SIGINT and SIGTERM into a request to stop, so that the program can finish its work. Repeated signals are ignored.
+    """Turns ``STOP_SIGNALS`` into a request to stop, so that the program can finish its work. Repeated signals are ignored.
 
     The handlers of rclpy would shut the context down at once, and nothing could be published any more.
     Use it as a context manager in the main thread.
     """
 
-    SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
         self._since_s = 0.0
-        self._previous: dict[signal.Signals, object] = {}
+        self._handling = on_stop_signals(self._request)
 
     @property
     def requested(self) -> bool:
@@ -48,12 +47,11 @@ class StopRequest:
         return time.monotonic() - self._since_s if self.requested else 0.0
 
     def __enter__(self) -> StopRequest:
-        self._previous = {number: signal.signal(number, self._request) for number in self.SIGNALS}
+        self._handling.__enter__()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)  # type: ignore[arg-type]
+        self._handling.__exit__(kind, error, traceback)
 
     def _request(self, number: int, frame: FrameType | None) -> None:
         if self.signal is None:

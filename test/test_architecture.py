@@ -40,7 +40,7 @@ MAY_THREAD = {'splatam_core.worker', 'splatam_ros.node.node', 'splatam_ros.playe
 
 
 FLOORS: tuple[tuple[str, ...], ...] = (
-    ('splatam_core.errors', 'splatam_core.atomic_io'),
+    ('splatam_core.errors', 'splatam_core.atomic_io', 'splatam_core.output'),
     ('splatam_core.resources', 'splatam_core.settings', 'splatam_core.retired_settings', 'splatam_core.text_files'),
     ('splatam_core.config',),
     ('splatam_core.geometry',),

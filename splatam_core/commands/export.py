@@ -35,6 +35,8 @@ SUFFIXES = {
 }
 """The forms of a map, and the files that each is written to."""
 
+SMALLEST, LARGEST = 1e-6, 1e6
+
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
@@ -88,8 +90,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _number(text: str) -> float:
     value = float(text)
-    if not 0 < value < float('inf'):
-        raise argparse.ArgumentTypeError(f'{text} is not a number above 0')
+    if not SMALLEST <= value <= LARGEST:
+        raise argparse.ArgumentTypeError(f'{text} is not a number above 0, from {SMALLEST:g} to {LARGEST:g}')
     return value
 
 

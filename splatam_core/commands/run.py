@@ -25,6 +25,7 @@ from splatam_core.commands.shared import (
     usable_ground_truth,
 )
 from splatam_core.errors import FrameError, RunFolderError, SplatamError
+from splatam_core.interruption import STOP_SIGNALS, on_stop_signals
 
 if TYPE_CHECKING:
     from splatam_core.config import SlamConfig
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
     from splatam_core.runs.resume import CheckpointWriter
     from splatam_core.runs.writer import RunFolder
     from splatam_core.slam import Slam
-
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -217,10 +216,10 @@ def _resume_hint(path: Path) -> str:
 
 
 class _StopRequest:
-    """Turns Ctrl-C or SIGTERM into a request to stop after the frame or step at hand; the next of them interrupts at once.
+    """Turns a signal to stop into a request to stop after the frame or step at hand; the next Ctrl-C or SIGTERM interrupts at once.
 
     Attributes:
-        requested: True once Ctrl-C was pressed or SIGTERM arrived.
+        requested: True once one of ``STOP_SIGNALS`` arrived.
         when: when the run will stop, for the user.
     """
 
@@ -229,16 +228,16 @@ class _StopRequest:
         self.when = 'after this frame'
 
     def __enter__(self) -> _StopRequest:
-        self._previous = {number: signal.signal(number, self._request) for number in STOP_SIGNALS}
+        self._handling = on_stop_signals(self._request)
+        self._handling.__enter__()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
+        self._handling.__exit__(kind, error, traceback)
 
     def _request(self, number: int, frame: FrameType | None) -> None:
         self.requested = True
-        for each in STOP_SIGNALS:
+        for each in STOP_SIGNALS[:2]:  # a terminal that ends may say so twice
             signal.signal(each, signal.default_int_handler)
         say(f'stopping {self.when}; Ctrl-C again stops at once, without saving the map')
 

@@ -77,7 +77,7 @@ struct MutableGaussians {
 // The images that a view is fitted to, and the weights of a difference per pixel and channel.
 struct Target {
   const std::uint8_t* rgb;  // [H, W, 3]
-  const float* depth;       // [H, W] metres, 0 = no reading
+  const float* depth;       // [H, W] metres, 0 = no reading, negative = the pixel is not compared
   float color_weight, depth_weight;
   float color_limit, depth_limit;  // up to here Huber's loss is quadratic
 };

@@ -387,8 +387,8 @@ static inline Comparison compare(Lanes r, Lanes g, Lanes b, Lanes depth, const T
   if (tile.y + row >= camera.height) return result;
   const int columns = columns_of(tile, camera);
   const std::size_t at = std::size_t(tile.y + row) * camera.width + tile.x;
-  const IntLanes real = int_iota() < splat_int(columns);
   const Lanes reading = load_some(target.depth + at, columns, Lanes{});
+  const IntLanes real = (int_iota() < splat_int(columns)) & (reading >= 0.0f);
   const std::uint8_t* colors = target.rgb + 3 * at;
   const Lanes red = keep(real, r - load_bytes(colors, columns, 0)), by_r = huber_gradient(red, to.color);
   const Lanes green = keep(real, g - load_bytes(colors, columns, 1)), by_g = huber_gradient(green, to.color);

@@ -34,6 +34,22 @@ def box_sums(image: Tensor, side: int) -> Tensor:
     return torch.from_numpy(sums)
 
 
+def closed(mask: Tensor, reach: int, margin: int) -> Tensor:
+    """Returns [H, W] bool: a mask [H, W] whose holes of at most ``2 * reach`` pixels are closed, grown by a margin.
+
+    Args:
+        mask: [H, W] bool.
+        reach: pixels along rows and columns.
+        margin: pixels along rows and columns.
+    """
+    if not is_on_host(mask):
+        return closed_by_torch(mask, reach, margin)
+    if bool(mask.all()):
+        return mask
+    grown, shrunk_by = (np.ones((2 * size + 1,) * 2, np.uint8) for size in (reach + margin, reach))
+    return torch.from_numpy(cv2.erode(cv2.dilate(mask.numpy().view(np.uint8), grown), shrunk_by).view(np.bool_))
+
+
 def shrunk(rgb8: Tensor, width: int, height: int) -> Tensor:
     """Shrinks [H, W, 3] uint8 to [height, width, 3]: each pixel is the mean of the area it covers."""
     if not is_on_host(rgb8):
@@ -88,6 +104,12 @@ def _ssim_window(device: torch.device) -> Tensor:
 def box_sums_by_torch(image: Tensor, side: int) -> Tensor:
     """See ``box_sums``."""
     return functional.avg_pool2d(image[None, None], side, stride=1, padding=side // 2, divisor_override=1)[0, 0]
+
+
+def closed_by_torch(mask: Tensor, reach: int, margin: int) -> Tensor:
+    """See ``closed``."""
+    grown = functional.max_pool2d(mask[None, None].float(), 2 * (reach + margin) + 1, 1, reach + margin)
+    return functional.max_pool2d(-grown, 2 * reach + 1, 1, reach)[0, 0] < 0
 
 
 def shrunk_by_torch(rgb8: Tensor, width: int, height: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,10 +14,15 @@ from torch import Tensor
 
 from splatam_core.config import DepthConfig
 from splatam_core.geometry.camera import PinholeCamera
-from splatam_core.images.filters import nearest, shrunk
+from splatam_core.images.filters import box_sums, closed, nearest, shrunk
 from splatam_core.images.rectification import kept
 from splatam_core.images.spacing import reading_spacing, shrunk_readings, spacing_of_grid
 from splatam_core.types import RgbdFrame
+
+NEAR_PX, HOLE_REACH = 1, 0.025
+"""A pixel is near a reading within so many pixels of one, or in a hole of at most twice this fraction of the image's width."""
+
+MIN_AROUND = 2.5  # readings, itself included, of which at least 3 are needed; box sums are inexact
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +45,10 @@ class View:
     def from_frame(cls, frame: RgbdFrame, config: DepthConfig) -> View:
         """Returns the frame's images in the host's memory, with the depth readings that are used (see ``usable_depth``)."""
         depth_m = usable_depth(frame.depth_m, config)
-        rgb8 = torch.from_numpy(np.require(frame.rgb, requirements=['C', 'W']))  # torch takes no read-only memory
-        return cls(frame.camera, rgb8, torch.from_numpy(depth_m), reading_spacing(depth_m))
+        rgb = np.require(frame.rgb, requirements=['C', 'W'])  # torch takes no read-only memory
+        if min(rgb.strides) < 0:  # a row or column of pixels counts as contiguous in any direction
+            rgb = rgb.copy()
+        return cls(frame.camera, torch.from_numpy(rgb), torch.from_numpy(depth_m), reading_spacing(depth_m))
 
     def to(self, device: torch.device) -> View:
         """Returns the view on a device; itself if it is there already."""
@@ -58,6 +66,17 @@ class View:
     def valid(self) -> Tensor:
         """[H, W] bool, True where there is a reading."""
         return self.depth > 0
+
+    def near_readings(self) -> Tensor:
+        """Returns [H, W] bool, False where no reading is near: at which distance is what colour shows there, nobody knows.
+
+        Readings with fewer than two others around them do not count: half a percent of a stereo camera's readings are speckles,
+        and few of them would fill the sky. Not cached: a keyframe is seven bytes a pixel.
+        """
+        valid = (self.depth > 0).float()
+        around = box_sums(valid, 2 * math.ceil(self.spacing) + 3)
+        reach = max(round(HOLE_REACH * self.camera.width), math.ceil(self.spacing))
+        return closed((valid > 0) & (around > MIN_AROUND), reach, NEAR_PX)
 
     def scaled(self, scale: float) -> View:
         """Returns the view resized: colour by area, depth by the nearest pixel, or reading where depth is a grid with holes."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
@@ -59,7 +60,8 @@ def render_along(
         progress: wraps the loop over the poses, to display progress.
 
     Raises:
-        RasterizerError: this OpenCV build cannot write the videos, or an image cannot be written.
+        RasterizerError: this OpenCV build cannot write the videos, or an image is too large.
+        OSError: the folder cannot be written.
     """
     map_only = gaussians.detached()
     far_m: float | None = None  # one depth scale for the whole video, set by the first view that has depth: no flicker
@@ -76,6 +78,8 @@ def render_along(
                 _write_images(folder, index, view)
             for kind, film in films.items():
                 film.write(_film_picture(kind, view, far_m or 1.0))
+    for kind in films:
+        _check_is_whole(folder / f'{kind}.mp4', len(path))
 
 
 def median_rate_hz(path: Trajectory) -> float:
@@ -94,6 +98,19 @@ def _film(stack: ExitStack, folder: Path, kind: str, camera: PinholeCamera, rate
     return film
 
 
+def _check_is_whole(film: Path, num_pictures: int) -> None:
+    """Checks that a video holds as many pictures as were written to it; OpenCV does not notice a full disk.
+
+    Raises:
+        OSError: it does not.
+    """
+    reader = cv2.VideoCapture(str(film))
+    num_found = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
+    reader.release()
+    if num_found != num_pictures:
+        raise OSError(errno.ENOSPC, f'{film.name} holds {num_found} of {num_pictures} pictures; is the disk full?', str(film))
+
+
 def _film_picture(kind: str, view: RenderedView, far_m: float) -> Picture:
     """Return the video frame [H, W, 3] in BGR, as OpenCV expects it."""
     if kind == 'color':
@@ -110,9 +127,10 @@ def _write_images(folder: Path, index: int, view: RenderedView) -> None:
     depth = np.rint(np.clip(view.depth_m * DEPTH_COUNTS_PER_M, 0, MAX_COUNT)).astype(np.uint16)
     pictures: dict[str, NDArray[np.integer]] = {'color': view.rgb[..., ::-1], 'depth': depth, 'silhouette': _silhouette(view)}
     for kind, picture in pictures.items():
-        path = folder / kind / f'{index:06d}.png'
-        if not cv2.imwrite(str(path), picture):
-            raise RasterizerError(f'{path}: cannot be written')
+        is_encoded, png = cv2.imencode('.png', picture)  # cv2.imwrite does not notice a full disk
+        if not is_encoded:
+            raise RasterizerError(f'{kind} of {picture.shape[1]}x{picture.shape[0]} pixels cannot be written as PNG')
+        (folder / kind / f'{index:06d}.png').write_bytes(png.tobytes())
 
 
 def _silhouette(view: RenderedView) -> Picture:

@@ -41,6 +41,9 @@ FIT_BETA_2 = 0.99
 COLOR_LIMIT, DEPTH_LIMIT_M = 0.1, 0.02
 """Of ``fit``: limits of Huber's loss, quadratic below and linear above."""
 
+NOT_COMPARED = -1.0
+"""Depth in a ``Target`` of pixels of which neither colour nor depth is compared."""
+
 HUGE = 1e30
 """No value of a Gaussian is larger: its square would overflow, and so would the colour in a map file."""
 
@@ -192,9 +195,9 @@ class Target:
     Attributes:
         camera: the camera of the images.
         rgb8: [H, W, 3] uint8.
-        depth: [H, W] metres, 0 = no reading.
+        depth: [H, W] metres; 0 = no reading, only colour is compared; negative, ``NOT_COMPARED`` = nothing is.
         T_cam_world: [4, 4] float32.
-        color_weight: weight of the mean Huber loss of colour, over pixels and channels.
+        color_weight: weight of the mean Huber loss of colour, over pixels and channels, those that are not compared included.
         depth_weight: weight of the mean Huber loss of depth_acc, over readings.
     """
 

@@ -82,7 +82,7 @@ class CpuRasterizer:
         check_isotropic(gaussians)
         _check(gaussians, target.T_cam_world)
         _check_fit(gaussians, moments, target)
-        camera, readings = target.camera, max(1, int(torch.count_nonzero(target.depth)))
+        camera, readings = target.camera, max(1, int(torch.count_nonzero(target.depth > 0)))
         with native_errors():
             return self._engine.fit(
                 **_arrays(gaussians),

@@ -81,7 +81,7 @@ class ReferenceRasterizer:
 
 
 def _loss(render: Render, target: Target) -> Tensor:
-    color = _huber(render.rgb - target.rgb8.permute(2, 0, 1) / 255, COLOR_LIMIT).mean()
+    color = (_huber(render.rgb - target.rgb8.permute(2, 0, 1) / 255, COLOR_LIMIT) * (target.depth >= 0)).mean()
     read = target.depth > 0
     depth = (_huber(render.depth_acc - target.depth, DEPTH_LIMIT_M) * read).sum() / read.sum().clamp(min=1)
     return target.color_weight * color + target.depth_weight * depth

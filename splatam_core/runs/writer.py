@@ -199,6 +199,7 @@ class RunFolder:
         temporary = path.with_name(f'.{path.name}.{os.getpid()}')
         try:
             self.sync()
+            shutil.rmtree(temporary, ignore_errors=True)  # see new_folder
             shutil.copytree(self.path, temporary)
             temporary.replace(path)
         except (OSError, ValueError) as error:

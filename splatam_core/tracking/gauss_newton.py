@@ -201,7 +201,7 @@ class GaussNewton:
 
     def _weighted(self, pair: _Pair, scales: tuple[float, float]) -> tuple[float, float]:
         """Returns the scales of the residuals of brightness and depth, divided by the roots of their weights."""
-        # What lies between readings repeats their errors, so that all of it counts as much as the readings alone.
+        # What lies between readings repeats their errors, and adds some.
         weights = self._config.color_weight, self._config.depth_weight * pair.depth_share
         color, depth = (scale / math.sqrt(max(weight, _LEAST_WEIGHT)) for scale, weight in zip(scales, weights, strict=True))
         return color, depth

@@ -21,6 +21,7 @@ EDGE = 0.05
 """Depth that changes by more than this fraction from one pixel to the next is an edge, not a surface."""
 
 _MAX_HOLE = 0.025  # of the width: wider holes of the depth stay open
+_SHARE_POWER = 3  # 2 is the fraction of readings; what lies between them has errors of its own (docs/decisions/0010)
 _COARSEST_PX = 32  # smaller images show too little to align
 _LEAST_SILHOUETTE = 1e-3  # to divide by
 _DEPTH_LAYER = 3
@@ -34,7 +35,7 @@ class Level:
         camera: its pinhole.
         brightness: [H, W] in [0, 1]; an array on the host, else a tensor.
         depth: [H, W] metres; NaN where there is none.
-        depth_share: fraction of the depths that are readings of their own; the others lie between readings.
+        depth_share: weight of a depth relative to dense depth, at most 1; less where many depths lie between readings.
     """
 
     camera: PinholeCamera
@@ -49,7 +50,7 @@ def frame_level(view: View, aligner: Aligner[Any]) -> Level:
     Half of a stereo camera's readings may be missing, and depth that was registered by forward warping has a grid of holes.
     Halving drops every block with a hole, and colour is compared only at points of known depth.
     """
-    max_gap, share = max(1, round(_MAX_HOLE * view.camera.width)), view.spacing**-2
+    max_gap, share = max(1, round(_MAX_HOLE * view.camera.width)), view.spacing**-_SHARE_POWER
     if not is_on_host(view.depth):
         readings = torch.where(view.valid, view.depth, torch.nan)
         return Level(view.camera, brightness(view.rgb8), aligner.fill_holes(readings, max_gap, EDGE), share)

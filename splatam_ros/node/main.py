@@ -14,6 +14,7 @@ from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.logging import get_logger
 
 from splatam_core.errors import SplatamError
+from splatam_core.output import unfailing_output
 from splatam_core.settings import Setting
 from splatam_ros.node.node import SplatamNode
 from splatam_ros.node.parameters import NODE_SETTINGS
@@ -109,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node. Returns the exit code: 0 = success, 1 = SLAM or saving failed, 2 = cannot start."""
     own, for_ros = split_arguments(sys.argv[1:] if arguments is None else arguments)
     make_parser().parse_args(own)
-    with StopRequest() as stop:
+    with unfailing_output(results=False), StopRequest() as stop:
         try:
             return run(for_ros, stop)
         except SplatamError as error:

@@ -11,7 +11,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from splatam_ros.player.keyboard import Key, Keyboard
-from splatam_ros.player.pacing import PlaybackClock
+from splatam_ros.player.pacing import PlaybackClock, why_no_rate
 
 RATE_STEP = 1.1
 Outcome = tuple[bool, str]
@@ -127,10 +127,8 @@ class Controls:
 
 def _check_rate(changed: list[Parameter]) -> SetParametersResult:
     for parameter in changed:
-        value = parameter.value
-        is_number = type(value) in (int, float)
-        if parameter.name == 'rate' and not (is_number and 0 < value < float('inf')):
-            return SetParametersResult(successful=False, reason=f'rate = {value!r}: expected a number above 0')
+        if parameter.name == 'rate' and (why := why_no_rate(parameter.value)):
+            return SetParametersResult(successful=False, reason=why)
     return SetParametersResult(successful=True)
 
 

@@ -14,15 +14,19 @@ from rclpy.node import Node
 from splatam_core.datasets.bag.recording import Recording
 from splatam_core.errors import SplatamError
 from splatam_core.geometry.trajectory import stamp_from_text
+from splatam_core.output import unfailing_output
 from splatam_ros.player.back_pressure import PlaybackError
 from splatam_ros.player.keyboard import Keyboard
 from splatam_ros.player.options import ANSWER_TOPICS, make_options
+from splatam_ros.player.pacing import why_no_rate
 from splatam_ros.player.playable import find_playable
 from splatam_ros.player.player import Interrupted, Player
 from splatam_ros.process import StopRequest, ros, split_arguments
 
 PROGRAM = 'splatam_bag_player'
 EXIT_PLAYBACK, EXIT_USAGE = 1, 2
+LARGEST = 10**9
+"""Of any number of the command line: 30 years, in nanoseconds, fit into 64 bits."""
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -144,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     own, for_ros = split_arguments(sys.argv[1:] if arguments is None else arguments)
     args = make_parser().parse_args(own)
-    with StopRequest() as stop:
+    with unfailing_output(results=False), StopRequest() as stop:
         try:
             play(args, for_ros, stop)
         except Interrupted as interrupted:
@@ -165,20 +169,20 @@ def _print_error(text: str) -> None:
 
 
 def _seconds(text: str) -> float:
-    if not 0 <= (value := float(text)) < float('inf'):
-        raise argparse.ArgumentTypeError(f'{text}: expected 0 or more')
+    if not 0 <= (value := float(text)) <= LARGEST:
+        raise argparse.ArgumentTypeError(f'{text}: expected 0 or more, at most {LARGEST:g}')
     return value
 
 
 def _positive(text: str) -> float:
-    if not 0 < (value := float(text)) < float('inf'):
-        raise argparse.ArgumentTypeError(f'{text}: expected more than 0')
+    if not 1 / LARGEST <= (value := float(text)) <= LARGEST:
+        raise argparse.ArgumentTypeError(f'{text}: expected more than 0, {1 / LARGEST:g} to {LARGEST:g}')
     return value
 
 
 def _count(text: str) -> int:
-    if (value := int(text)) < 1:
-        raise argparse.ArgumentTypeError(f'{text}: expected 1 or more')
+    if not 1 <= (value := int(text)) <= LARGEST:
+        raise argparse.ArgumentTypeError(f'{text}: expected 1 or more, at most {LARGEST:g}')
     return value
 
 
@@ -203,7 +207,10 @@ def _regex(text: str) -> re.Pattern[str]:
 
 
 def _rate(text: str) -> float:
-    return 0.0 if text == 'max' else _seconds(text)
+    value = 0.0 if text == 'max' else float(text)
+    if value != 0 and (why := why_no_rate(value)):
+        raise argparse.ArgumentTypeError(why)
+    return value
 
 
 def _remap(text: str) -> tuple[str, str]:

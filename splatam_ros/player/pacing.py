@@ -12,6 +12,15 @@ from dataclasses import dataclass
 from msg_adapters.interval import PairInterval
 from splatam_core.geometry.trajectory import stamp_text
 
+MIN_RATE, MAX_RATE = 1e-6, 1e6
+
+
+def why_no_rate(value: object) -> str:
+    """Returns why a value cannot be the rate of playback; empty if it can."""
+    if type(value) in (int, float) and MIN_RATE <= value <= MAX_RATE:  # type: ignore[operator]
+        return ''
+    return f'rate = {value!r}: expected a number above 0, from {MIN_RATE:g} to {MAX_RATE:g}'
+
 
 class PlaybackClock:
     """Recording time that runs at a multiple of wall time, and stands still while frozen."""

@@ -41,13 +41,11 @@ def splatam(*arguments: object) -> int:
     return main([str(argument) for argument in arguments])
 
 
-def start(*arguments: object) -> subprocess.Popen[str]:
-    """The command line as a process of its own."""
-    code = 'import sys; from splatam_core.cli import main; sys.exit(main())'
-    return subprocess.Popen(
-        [sys.executable, '-c', code, *map(str, arguments)],
-        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+def start(*arguments: object, before: str = '', **options: object) -> subprocess.Popen[str]:
+    """The command line as a process of its own. before: Python that it runs before."""
+    code = f'import os, signal, sys; {before}\nfrom splatam_core.cli import main; sys.exit(main())'
+    pipes = {'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE} | options
+    return subprocess.Popen([sys.executable, '-c', code, *map(str, arguments)], cwd=ROOT, text=True, **pipes)
 
 
 def metrics(folder: Path) -> dict[str, object]:
@@ -280,7 +278,7 @@ def long_run(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], Path]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.usefixtures('undrawn')
 def test_interrupt_saves_what_was_done(long_run: tuple[subprocess.Popen[str], Path], number: signal.Signals) -> None:
     process, folder = long_run
@@ -295,6 +293,27 @@ def test_interrupt_saves_what_was_done(long_run: tuple[subprocess.Popen[str], Pa
     if number is signal.SIGINT:
         assert splatam('evaluate', folder, '--every', 2) == 0
         assert metrics(folder)['ate_rmse_m'] is not None
+
+
+@pytest.mark.slow
+def test_a_terminal_that_is_gone_ends_no_run_started_with_nohup(tmp_path: Path) -> None:
+    ignored = 'signal.signal(signal.SIGHUP, signal.SIG_IGN); os.kill(os.getpid(), signal.SIGHUP)'
+    process = start('run', SOURCE, *SMALL, *SETTINGS, '--no-evaluate', '--out', tmp_path / 'run', before=ignored)
+    assert process.wait(60) == 0 and metrics(tmp_path / 'run')['frames'] == FRAMES
+    assert 'stopping' not in process.communicate()[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('what', ['closed', 'nobody reads', 'full'])
+def test_messages_that_cannot_be_printed_cost_nothing_of_the_run(tmp_path: Path, what: str) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    target = {'closed': None, 'nobody reads': writer, 'full': os.open('/dev/full', os.O_WRONLY)}[what]
+    closing = 'os.close(2); sys.stderr = None' if target is None else ''  # as Python finds it after 2>&-
+    arguments = ['run', SOURCE, *SMALL, *SETTINGS, '--no-evaluate', '--out', tmp_path / 'run']
+    process = start(*arguments, before=closing, stderr=target)
+    assert 'frames' in process.communicate(timeout=60)[0] and process.returncode == 0
+    assert metrics(tmp_path / 'run')['frames'] == FRAMES and len(read_ply(tmp_path / 'run' / 'map.ply').means) > 0
 
 
 @pytest.mark.slow

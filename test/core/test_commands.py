@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import shutil
 import sys
 from pathlib import Path
@@ -191,6 +192,21 @@ def test_render_refuses_what_leaves_nothing(run: RunRecord, tmp_path: Path, caps
     assert not (tmp_path / 'film').exists()
 
 
+@pytest.mark.parametrize('what', ['--no-video', '--no-images'])
+def test_a_disk_that_is_full_while_rendering_is_said(
+    run: RunRecord, tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str
+) -> None:
+    """OpenCV reports it for neither images nor videos."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        code = splatam('render', run.path, '--out', tmp_path / 'film', what)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert code == 2 and 'cannot be written' in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 # --- refine ---
 
 
@@ -268,6 +284,14 @@ def test_export_of_a_grid_needs_a_floor(run: RunRecord, tmp_path: Path, capsys: 
     (tmp_path / 'm.yaml').unlink()
     assert splatam('export', run.path, tmp_path / 'm.yaml', '--as', 'grid') == 2
     assert 'm.pgm exists' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('value', ['1e300', '1e-300', 'inf', 'nan', '-1'])
+def test_lengths_beyond_any_use_are_refused(value: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ('resolution', 'max-depth', 'max-height', 'voxel', 'min-opacity'):
+        with pytest.raises(SystemExit):
+            splatam('export', 'run', 'm.yaml', '--as', 'grid', f'--{name}={value}')
+        assert 'is not a number above 0' in capsys.readouterr().err
 
 
 def test_export_of_points_is_the_opaque_centres(run: RunRecord, tmp_path: Path) -> None:

@@ -32,6 +32,22 @@ def test_resizing_equals_opencvs(width: int, height: int) -> None:
     assert torch.equal(filters.nearest_by_torch(depth, width, height), filters.nearest(depth, width, height))
 
 
+@pytest.mark.parametrize(('reach', 'margin'), [(1, 0), (3, 2), (8, 2)])
+def test_closing_equals_opencvs(reach: int, margin: int) -> None:
+    mask = _random(33, 47) < 0.01
+    mask[:, :9] = False
+    closed = filters.closed(mask, reach, margin)
+    assert torch.equal(filters.closed_by_torch(mask, reach, margin), closed) and (closed >= mask).all()
+    assert filters.closed(torch.ones(4, 5, dtype=torch.bool), reach, margin).all()
+
+
+def test_holes_are_closed_and_edges_stay_where_they_are() -> None:
+    mask = torch.zeros(20, 60, dtype=torch.bool)
+    mask[:, :10] = mask[:, 15:30] = True  # a hole of 5 pixels, and an edge
+    closed = filters.closed(mask, 3, 2)[10]
+    assert closed[:32].all() and not closed[32:].any()
+
+
 @pytest.mark.parametrize('share', [0.0, 0.001, 0.5, 1.0])
 def test_median_is_torchs_own_of_what_counts(share: float) -> None:
     values, counts = _random(40, 50), _random(40, 50) < share

@@ -17,7 +17,7 @@ from splatam_core.errors import RasterizerError
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.rasterizer import Gaussians, Moments, Rasterizer, Rates, Target, make_rasterizer, native
-from splatam_core.rasterizer.base import MAX_ALPHA, MIN_ALPHA
+from splatam_core.rasterizer.base import MAX_ALPHA, MIN_ALPHA, NOT_COMPARED
 from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.rasterizer.reference import ReferenceRasterizer
 
@@ -147,11 +147,12 @@ def test_fitting_natively_refuses_arrays_that_it_would_copy() -> None:
 
 
 def _target(scene: Scene, device: str = 'cpu') -> Target:
-    """Noise, with holes in the depth."""
+    """Noise, with holes in the depth, and a corner that is not compared."""
     camera, generator = scene.camera, torch.Generator().manual_seed(1)
     rgb8 = torch.randint(0, 256, (camera.height, camera.width, 3), generator=generator, dtype=torch.uint8)
     depth = 4 * torch.rand(camera.height, camera.width, generator=generator)
     depth[depth < 0.5] = 0.0
+    depth[: camera.height // 3, : camera.width // 3] = NOT_COMPARED
     return Target(camera, rgb8.to(device), depth.to(device), scene.T_cam_world.float().to(device), 0.5, 1.0)
 
 
@@ -185,6 +186,19 @@ def _assert_fits_like_the_reference(rasterizer: Rasterizer, scene: Scene, device
     assert (moments.steps == expected_moments.steps).float().mean() > 0.99 or not len(first)
     for one, other in zip(actual, expected, strict=True):
         assert one.shape == other.shape and torch.isfinite(one).all()
+
+
+@pytest.mark.parametrize(('backend', 'threads'), [('reference', 1), ('cpu', 2), ('triton', 0)])
+def test_pixels_that_are_not_compared_change_nothing(backend: str, threads: int) -> None:
+    scene, device = SCENES['odd size'], scenes.device_of(backend)
+    target, fitted = _target(scene, device), []
+    for value in (0, 255):
+        gaussians, count = scenes.on_device(scene.gaussians, device), len(scene.gaussians)
+        moments = Moments(torch.zeros(count, 16, device=device), torch.zeros(count, dtype=torch.uint8, device=device))
+        target.rgb8[target.depth == NOT_COMPARED] = value
+        loss = float(make_rasterizer(backend, threads).fit(gaussians, moments, Rates(1e-4, 1e-3, 0.05, 2.5e-3), target))
+        fitted.append([loss, *(getattr(gaussians, name).cpu() for name in scenes.PARAMETERS)])
+    assert all(np.array_equal(*values) for values in zip(*fitted, strict=True))
 
 
 @pytest.mark.parametrize('scene', [scenes.random_scene(11, 25, 16, 12), scenes.anisotropic_scene(11, 25, 16, 12)])

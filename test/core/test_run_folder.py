@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatam_core.atomic_io import new_folder
 from splatam_core.config import load_config
 from splatam_core.errors import RunFolderError
 from splatam_core.geometry import se3
@@ -292,6 +293,18 @@ def test_a_link_to_nowhere_is_said_in_one_line(tmp_path: Path) -> None:
     for overwrite in (False, True):
         with pytest.raises(RunFolderError, match='exists: choose another folder'):
             RunFolder.create(tmp_path / 'link', CONFIG, NODE, overwrite=overwrite)
+
+
+def test_what_a_killed_process_of_the_same_number_left_is_replaced(tmp_path: Path) -> None:
+    for name in ('new', 'moved'):
+        (tmp_path / f'.{name}.{os.getpid()}').mkdir()
+        (tmp_path / f'.{name}.{os.getpid()}' / 'cut.png').touch()
+    with new_folder(tmp_path / 'new') as folder:
+        (folder / 'whole.png').touch()
+    folder = written(RunFolder.create(tmp_path / 'run', CONFIG, NODE), 0).moved(tmp_path / 'moved')
+    folder.close()
+    assert {path.name for path in tmp_path.iterdir()} == {'new', 'run', 'moved'}
+    assert [path.name for path in (tmp_path / 'new').iterdir()] == ['whole.png'] and len(read_run(tmp_path / 'moved').frames) == 1
 
 
 def test_a_reset_leaves_what_others_put_into_previous(tmp_path: Path) -> None:

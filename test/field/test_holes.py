@@ -174,8 +174,8 @@ def test_the_node_says_it_in_the_same_words() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('preset', ['realtime', 'quick'])
-def test_a_grid_is_tracked_like_dense_depth_and_said_once(preset: str, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize(('preset', 'most'), [('realtime', 1.5), ('quick', 2.2)])
+def test_a_grid_is_tracked_like_dense_depth_and_said_once(preset: str, most: float, caplog: pytest.LogCaptureFixture) -> None:
     room = SyntheticSequence(width=160, frames=40)
     dense_m, _ = errors_m(room, preset, len(room))
     assert not caplog.records
@@ -183,8 +183,8 @@ def test_a_grid_is_tracked_like_dense_depth_and_said_once(preset: str, caplog: p
         caplog.clear()
         thinned_m, num_lost = errors_m(ThinnedSequence(room, ratio, bent), preset, len(room))
         assert num_lost == 0
-        # A ratio squared fewer readings average their noise a ratio worse; in such small frames it is most of the error.
-        assert thinned_m < 1.25 * ratio * max(dense_m, 0.002)
+        # quick fits 53x40 readings in ten steps: what it maps is 0.4 % too far away.
+        assert thinned_m < most * max(dense_m, 0.002)
         (record,) = caplog.records
         assert 'grid of holes' in record.message and 'fill_upsampling_holes' in record.message
 
@@ -220,6 +220,20 @@ def test_far_stereo_gives_no_fog_in_front_of_the_surfaces(preset: str, num_frame
     assert all(np.isfinite(values).all() for values in (slam.snapshot().means, slam.snapshot().log_scales))
     for index in (0, num_frames - 1):
         assert fog(slam, results[index].T_world_cam, street.pose(index)) < 0.01
+
+
+@pytest.mark.slow
+def test_the_edge_of_a_roof_does_not_grow_into_the_sky() -> None:
+    street = FarStereo(40)
+    slam = Slam(load_config('realtime', ['threads=1']), num_frames=len(street))
+    results = [slam.process(street[index]) for index in range(len(street))]
+    slam.finish()
+    for index in (0, len(street) - 1):
+        _, depth_m = FarStereo.true_view(street.pose(index))
+        far_from_surfaces = cv2.erode((depth_m >= SKY_M).view(np.uint8), np.ones((21, 21), np.uint8)).view(bool)
+        rendered = slam.render(results[index].T_world_cam)
+        assert far_from_surfaces.sum() > 5000
+        assert (rendered.silhouette[far_from_surfaces] > 0.5).mean() < 0.05
 
 
 def test_speckles_add_nothing_and_thin_things_stay() -> None:

@@ -24,6 +24,7 @@ from splatam_core.datasets import files
 from splatam_core.datasets.camera_file import read_camera_file
 from splatam_core.errors import CameraError, DatasetError, FrameError, SplatamError
 from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.images.view import View
 from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame
 
@@ -48,6 +49,16 @@ def test_a_frame_that_is_not_of_its_camera_costs_itself(preset: str, change: dic
             slam.process(replace(frame, **change))
         slam.process(frame)
         frame = replace(frame, stamp_ns=frame.stamp_ns + 1)
+
+
+@pytest.mark.parametrize(('width', 'height'), [(24, 16), (1, 20), (20, 1), (1, 1)])
+@pytest.mark.parametrize('turned', [np.s_[::-1], np.s_[:, ::-1], np.s_[::-1, ::-1]])
+def test_images_that_are_views_of_turned_ones_are_used(width: int, height: int, turned: slice) -> None:
+    rgb = np.random.default_rng(0).integers(0, 255, (height, width, 3), np.uint8)[turned]
+    depth_m = np.ones((height, width), np.float32)[turned]
+    frame = RgbdFrame(1, rgb, depth_m, replace(CAMERA, width=width, height=height))
+    view = View.from_frame(frame, load_config('quick').depth)
+    assert np.array_equal(view.rgb8.numpy(), rgb) and np.array_equal(view.depth.numpy(), depth_m)
 
 
 def test_images_that_cannot_be_written_to_are_used() -> None:

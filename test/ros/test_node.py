@@ -261,7 +261,7 @@ def start_playback(graph: Graph, bag: Path, **parameters: Any) -> tuple[Process,
     return node, player, out
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_in_mid_run_leave_a_whole_folder(graph: Graph, bag: Path, number: signal.Signals) -> None:
     node, player, out = start_playback(graph, bag)
     node.send(number)

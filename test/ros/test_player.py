@@ -359,7 +359,7 @@ UNUSABLE_ARGUMENTS = {
     '/nowhere/some.bag': '/nowhere/some.bag',
     'BAG --topics /rgb/imag': '/rgb/imag is not in',
     'BAG --start-offset 5': 'lasts 0.4 s',
-    'BAG --rate -1': 'expected 0 or more',
+    'BAG --rate -1': 'expected a number above 0',
     'BAG --remap /a': 'expected /recorded:=/published',
     'BAG --discovery-timeout 0.5': 'nobody subscribes to /depth/image or /rgb/image',
     'BAG --no-wait-for-subscribers --wait-for --discovery-timeout 0.5': 'nobody publishes /splatam/pose',

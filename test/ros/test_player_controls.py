@@ -93,7 +93,7 @@ def test_the_rate_is_a_parameter(graph: Graph, bag: Path) -> None:
     remote = Remote(graph, player)
     graph.spin_until(lambda: received[RGB], explain=lambda: player.text)
     assert remote.rate() == 0.001
-    for wrong in (0.0, -1.0, float('inf'), float('nan'), 'fast'):
+    for wrong in (0.0, -1.0, 1e300, 1e-300, float('inf'), float('nan'), 'fast'):
         successful, reason = remote.set_rate(wrong)
         assert not successful and 'expected a number above 0' in reason
     assert remote.rate() == 0.001

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import struct
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,6 +25,7 @@ from std_msgs.msg import String
 from test_player import DEPTH, INFO, LATCHED, RGB, assert_complaints, complaint, finish, recorded, stamp_ns, subscribe
 
 from splatam_core.resources import config_dir
+from splatam_ros.player.main import _count, _positive, _rate, _seconds, make_parser
 
 STEP_NS = 10**9 // 30
 NO_TIME = QosTime(0, 0)
@@ -435,6 +439,25 @@ UNUSABLE_SWITCHES = {
     '--read-ahead-queue-size 0': 'expected 1 or more',
     '--delay -1': 'expected 0 or more',
 }
+
+
+def test_messages_that_nobody_reads_cost_nothing_of_playing(graph: Graph, bag: Path) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, '-m', 'splatam_ros.player.main', bag, '--no-wait-for-subscribers', '--rate', 'max']
+    assert subprocess.run(command, stdout=writer, stderr=writer, timeout=60, check=False).returncode == 0
+    os.close(writer)
+
+
+@pytest.mark.parametrize('value', ['1e300', '-1e300', 'inf', 'nan', '1' + 30 * '0'])
+def test_numbers_beyond_any_use_are_refused(value: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each is multiplied or divided to nanoseconds, periods and rates, of which none may overflow."""
+    numbers = [action for action in make_parser()._actions if action.type in (_seconds, _positive, _count, _rate)]
+    assert len(numbers) >= 10
+    for action in numbers:
+        with pytest.raises(SystemExit):
+            make_parser().parse_args(['BAG', f'{action.option_strings[-1]}={value}'])
+        assert action.option_strings[-1] in capsys.readouterr().err
 
 
 def test_switches_that_cannot_be_used_are_one_line(graph: Graph, bag: Path) -> None:

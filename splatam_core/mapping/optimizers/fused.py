@@ -6,12 +6,14 @@ import time
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+import torch
 
 from splatam_core.config import MappingConfig
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.optimizers.base import TimeLimit, prune, rates
 from splatam_core.mapping.posed import PosedView
 from splatam_core.rasterizer import Rasterizer, Rates, Target
+from splatam_core.rasterizer.base import NOT_COMPARED
 
 FINAL_FIRST, FINAL_LAST = 5.0, 0.2
 """Step sizes at the beginning and at the end of ``finish``, relative to those of ``fit``."""
@@ -21,7 +23,10 @@ FINAL_MEANS, FINAL_SCALES = 0.3, 3.0
 
 
 class FusedOptimizer:
-    """Huber loss without SSIM; moments live as long as their Gaussians; only visible Gaussians move."""
+    """Huber loss without SSIM; moments live as long as their Gaussians; only visible Gaussians move.
+
+    Colour far from every reading is not compared: Gaussians at the edge of a roof would grow into the sky to explain it.
+    """
 
     def __init__(self, rasterizer: Rasterizer, config: MappingConfig) -> None:
         self._rasterizer, self._config = rasterizer, config
@@ -48,7 +53,8 @@ class FusedOptimizer:
 
     def _step(self, gaussian_map: GaussianMap, posed: PosedView, rates: Rates) -> None:
         view, config = posed.view, self._config
-        target = Target(view.camera, view.rgb8, view.depth, posed.T_cam_world, config.color_weight, config.depth_weight)
+        depth = torch.where(view.near_readings(), view.depth, NOT_COMPARED)
+        target = Target(view.camera, view.rgb8, depth, posed.T_cam_world, config.color_weight, config.depth_weight)
         self._rasterizer.fit(gaussian_map.gaussians, gaussian_map.moments, rates, target)
 
 

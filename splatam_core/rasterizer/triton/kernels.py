@@ -524,11 +524,12 @@ def fit_tile(
     green = tl.load(rgb8 + 3 * at + 1, mask=on_image, other=0).to(tl.float32) / 255.0
     blue = tl.load(rgb8 + 3 * at + 2, mask=on_image, other=0).to(tl.float32) / 255.0
     range_m = tl.load(depth + at, mask=on_image, other=0.0)
+    compared = on_image & (range_m >= 0.0)
     weight = depth_weight / tl.maximum(tl.load(readings), 1).to(tl.float32)
-    loss_r, gr = _difference(r, red, color_weight, COLOR_LIMIT, on_image)
-    loss_g, gg = _difference(g, green, color_weight, COLOR_LIMIT, on_image)
-    loss_b, gb = _difference(b, blue, color_weight, COLOR_LIMIT, on_image)
-    loss_d, gd = _difference(d, range_m, weight, DEPTH_LIMIT_M, on_image & (range_m > 0.0))
+    loss_r, gr = _difference(r, red, color_weight, COLOR_LIMIT, compared)
+    loss_g, gg = _difference(g, green, color_weight, COLOR_LIMIT, compared)
+    loss_b, gb = _difference(b, blue, color_weight, COLOR_LIMIT, compared)
+    loss_d, gd = _difference(d, range_m, weight, DEPTH_LIMIT_M, compared & (range_m > 0.0))
     tl.store(losses + tl.program_id(0), tl.sum(loss_r + loss_g + loss_b + loss_d, axis=0))
     _to_entries(
         splats, order, entries, slots, gradients, begin, end, fits, x, y, on_image,
