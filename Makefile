@@ -15,7 +15,7 @@ FUZZ_MINUTES ?= 10
 export SPLATAM_DATA ?= $(abspath ../shared/data)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup test test-quick fuzz fuzz-long sanitize sanitize-threads lint format docs hooks tf2_msgs lpips demo paper-tables colcon check-aarch64 test-aarch64 wheels clean
+.PHONY: help setup test test-quick fuzz fuzz-long sanitize sanitize-threads lint format docs docs-gallery hooks tf2_msgs lpips demo paper-tables colcon check-aarch64 test-aarch64 wheels clean
 
 help:
 	@echo 'make setup           create $(VENV), build the native code and install the package (PYTHON=python3.11 chooses the interpreter)'
@@ -28,10 +28,11 @@ help:
 	echo 'make lint            check style, types and spelling: ruff, mypy, codespell, clang-format'
 	echo 'make format          rewrite Python and C++ files in the project'"'"'s format'
 	echo 'make docs            build the documentation site in build/site and check its links'
+	echo 'make docs-gallery    make the pictures of docs/gallery.md anew, from the synthetic room; needs chromium'
 	echo 'make hooks           run the checks of pre-commit at every git commit'
 	echo 'make tf2_msgs        build the messages of /tf into $(VENV), for a ROS that pip installed, which lacks them'
 	echo 'make lpips           download the weights of the LPIPS score into $(VENV): 64 MB'
-	echo 'make demo [BAG=path] play a recording into the node and score the result, in out/demo'
+	echo 'make demo [BAG=path] play a recording into the node, show the map grow in a browser, and score the result, in out/demo'
 	echo 'make paper-tables    run ablations, metrics and held-out views on the recordings in SPLATAM_DATA: hours; continues where it stopped'
 	echo 'make colcon          build and test as a ROS package, in a temporary workspace'
 	echo 'make check-aarch64   compile the native code for 64-bit ARM'
@@ -136,6 +137,9 @@ format: setup
 
 docs: setup $(VENV)/.docs
 	@$(BIN)/python -m mkdocs build --strict --quiet
+
+docs-gallery: setup
+	@$(BIN)/python tools/docs_gallery.py
 
 hooks: setup $(VENV)/.docs
 	@$(BIN)/pre-commit install

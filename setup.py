@@ -149,14 +149,17 @@ setup(
         ],
         'mesh': ['open3d>=0.18'],
         'spz': ['gsply>=0.4'],
+        'viewer': ['viser>=1.0'],
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'test': [
             'pytest>=7',
             'pytest-xdist>=3.5',
             'hypothesis>=6',
             'OpenEXR>=3.3',
+            'playwright>=1.40',  # drives the browser of the tests; it downloads none
             'pytorch-msssim>=1.0',
             'distributed>=2024.1',
+            'viser>=1.0',
             f'triton>=3.4; {HAS_TRITON_WHEEL}',  # interprets the GPU kernels on the CPU; CUDA builds of torch include it
         ],
     },

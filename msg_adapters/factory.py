@@ -94,8 +94,8 @@ def _rclpy_value(value: Any) -> Any:
     """Convert numpy arrays to what rclpy's fields take; for bytes, anything but array.array is 10 to 1000 times slower."""
     if not isinstance(value, np.ndarray):
         return value
-    if value.dtype != np.uint8:
+    if value.dtype not in (np.uint8, np.int8):
         return value.tolist()
-    buffer = array.array('B')
+    buffer = array.array('B' if value.dtype == np.uint8 else 'b')
     buffer.frombytes(np.ascontiguousarray(value).data)
     return buffer

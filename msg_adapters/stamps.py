@@ -68,6 +68,10 @@ def serialized_stamp_ns(data: bytes) -> int:
 
 def header(factory: MessageFactory, stamp_ns: int, frame_id: str) -> Any:
     """Make a ``std_msgs/Header``."""
+    return factory.make('std_msgs/msg/Header', stamp=time_message(factory, stamp_ns), frame_id=frame_id)
+
+
+def time_message(factory: MessageFactory, stamp_ns: int) -> Any:
+    """Make a ``builtin_interfaces/Time``."""
     sec, nanosec = from_ns(stamp_ns)
-    stamp = factory.make('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
-    return factory.make('std_msgs/msg/Header', stamp=stamp, frame_id=frame_id)
+    return factory.make('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)

@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from splatam_core.commands import ablations, bench, compare, convert, evaluate, export, lpips_weights, refine, render, run
+from splatam_core.commands import ablations, bench, compare, convert, evaluate, export, lpips_weights, refine, render, run, view
 from splatam_core.commands.shared import EXIT_ERROR, EXIT_INTERRUPTED
 from splatam_core.errors import SplatamError, one_line
 from splatam_core.interruption import on_stop_signals
@@ -23,6 +23,7 @@ COMMANDS = (
     render.COMMAND,
     refine.COMMAND,
     export.COMMAND,
+    view.COMMAND,
     bench.COMMAND,
     lpips_weights.COMMAND,
 )

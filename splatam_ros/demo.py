@@ -1,4 +1,4 @@
-"""``make demo``: plays a recording through player, DDS and node, as on a robot, and scores the result.
+"""``make demo``: plays a recording through player, DDS and node, as on a robot, shows the map grow, and scores the result.
 
 Run as ``python -m splatam_ros.demo [SOURCE] [--out DIR]``. DIR becomes the run's folder. The folder ``DIR-input`` beside
 it holds the SOURCE as a rosbag2 with the node's topic names and small images, and the node's log.
@@ -19,9 +19,17 @@ from contextlib import nullcontext
 from pathlib import Path
 from types import FrameType, TracebackType
 
+from splatam_core.errors import ViewerError
+from splatam_core.maps.viewer.browser import find_browser
+from splatam_core.maps.viewer.scene import check_viser
+from splatam_core.runs.layout import VIEWER_PICTURE
+
 SCENE = 'synthetic'
-SCENE_FRAMES = 150
+SCENE_FRAMES = 300
 WIDTH = 320
+PRESET = 'realtime'
+VIEWER_PORT = 8080
+VIEWER_LINE = 'viewer at '  # of the node's log
 MARKER = '.demo'
 COMMANDS = {
     'splatam': 'splatam_core.cli',
@@ -29,6 +37,7 @@ COMMANDS = {
     'splatam_bag_player': 'splatam_ros.player.main',
 }
 FINISH_TIMEOUT_S = 120.0
+VIEWER_TIMEOUT_S = 30.0
 STOP_TIMEOUT_S = 20.0
 LOG_LINES = 15
 
@@ -114,20 +123,62 @@ def require_replaceable(folder: Path) -> None:
         raise DemoError(f'{folder} exists and was not created by the demo: move it away, or choose another --out')
 
 
-def play(processes: Processes, bag: Path, out: Path, log: Path) -> None:
-    """Play the recording into the node until both have ended.
+def has_viewer() -> bool:
+    """Returns whether the map can be shown in a browser; if not, says why."""
+    try:
+        check_viser()
+    except ViewerError as error:
+        print(f'the map is not shown while it grows: {error}')
+        return False
+    return True
+
+
+def play(processes: Processes, bag: Path, out: Path, log: Path, *, is_shown: bool) -> None:
+    """Play the recording into the node, at its own rate, until both have ended.
+
+    Args:
+        processes: starts them.
+        bag: the recording.
+        out: folder of the run.
+        log: of the node.
+        is_shown: whether the node shows the map in a browser.
 
     Raises:
         DemoError: the player or the node failed.
     """
-    parameters = {'preset': 'quick', 'save_path': out, 'queue_policy': 'all', 'exit_on_publisher_end': 'true'}
+    parameters = {'preset': PRESET, 'save_path': out, 'queue_policy': 'all', 'exit_on_publisher_end': 'true'}
+    parameters |= {'viewer.port': VIEWER_PORT} if is_shown else {}
     settings = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
     node = processes.start('splatam_node', '--ros-args', *settings, log=log)
-    player = processes.start('splatam_bag_player', str(bag), '--rate', 'max', '--wait-for')
+    player = processes.start('splatam_bag_player', str(bag), '--wait-for')
     try:
+        if is_shown:
+            say_address(node, log)
         wait_for_both(player, node)
     except DemoError as error:
         raise DemoError(f'{error}; the last lines of {log}:\n{last_lines(log)}') from None
+
+
+def say_address(node: subprocess.Popen[bytes], log: Path) -> None:
+    """Wait until the node's log tells where the map is shown, and tell it."""
+    deadline_s = time.monotonic() + VIEWER_TIMEOUT_S
+    while node.poll() is None and time.monotonic() < deadline_s:
+        for line in log.read_text(errors='replace').splitlines():
+            if line.startswith(VIEWER_LINE):
+                print(f'watch the map grow: {line.removeprefix(VIEWER_LINE)}', flush=True)
+                return
+        time.sleep(0.1)
+
+
+def take_picture(processes: Processes, out: Path) -> None:
+    """Save what a browser shows of the map, which opens the report; say so if that is not possible."""
+    if find_browser() is None:
+        print('no picture of the viewer: apt install chromium')
+        return
+    try:
+        processes.run('splatam', 'view', str(out), '--screenshot', str(out / VIEWER_PICTURE))
+    except DemoError as error:
+        print(f'no picture of the viewer: {error}')
 
 
 def wait_for_both(player: subprocess.Popen[bytes], node: subprocess.Popen[bytes]) -> None:
@@ -168,15 +219,31 @@ def demo(source: str | None, out: Path) -> None:
     work.mkdir(parents=True)
     (work / MARKER).touch()
     cut = ('--max-frames', str(SCENE_FRAMES)) if source is None else ()
+    is_shown = has_viewer()
     with Processes() as processes:
         processes.run('splatam', 'convert', source or SCENE, str(bag), '--width', str(WIDTH), *cut)
         shutil.rmtree(out, ignore_errors=True)
         try:
-            play(processes, bag, out, work / 'node.log')
+            play(processes, bag, out, work / 'node.log', is_shown=is_shown)
+            if is_shown:
+                take_picture(processes, out)
             processes.run('splatam', 'evaluate', str(out), '--truth', str(bag))
         finally:
             if out.is_dir():
                 (out / MARKER).touch()
+
+
+def next_steps(out: Path) -> str:
+    """Returns three commands to try next."""
+    beside = Path(sys.executable).with_name('splatam')
+    program = os.path.relpath(beside) if beside.is_file() else 'splatam'
+    commands = (
+        (f'{program} view {out}', 'fly through the map, move through time'),
+        (f'{program} export {out} {out}/map.yaml --as grid', 'its floor plan, for Nav2'),
+        ('make demo BAG=path', 'the same with a recording of your own'),
+    )
+    width = max(len(command) for command, _ in commands)
+    return '\n'.join(['try next:', *(f'  {command:{width}}  # {what}' for command, what in commands)])
 
 
 def stop(number: int, frame: FrameType | None) -> None:
@@ -195,6 +262,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         demo(args.source, args.out)
         print(f'look at {args.out}/report.html; beside it are report.png, map.ply, trajectory.txt and metrics.json')
+        print(next_steps(args.out))
     except DemoError as error:
         print(f'demo: {error}', file=sys.stderr)
         return 1

@@ -6,6 +6,7 @@ import fcntl
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from other_native import use_other_native_build
 
 from splatam_core.config import SlamConfig, apply_threads
 from splatam_core.datasets.synthetic import SyntheticSequence
+from splatam_core.maps.viewer.browser import find_browser
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -78,6 +80,18 @@ def recording() -> Callable[[str], Path]:
         pytest.skip(message)
 
     return find
+
+
+@pytest.fixture(scope='session')
+def browser() -> str:
+    """Path of Chromium. If it is absent, or Playwright that drives it, the test is skipped; with SPLATAM_REQUIRE_BROWSER=1 it fails."""
+    program = find_browser()
+    if program is not None and find_spec('playwright') is not None:
+        return program
+    message = 'no Chromium: apt install chromium' if program is None else 'no Playwright: pip install playwright'
+    if os.environ.get('SPLATAM_REQUIRE_BROWSER') == '1':
+        pytest.fail(message)
+    pytest.skip(message)
 
 
 @pytest.fixture(scope='session')

@@ -22,6 +22,8 @@ OPTIONAL = {
     'distributed': 'splatam_core.commands.job_runners',
     'gsply': 'splatam_core.maps.splat',
     'open3d': 'splatam_core.maps.export',
+    'rich': 'splatam_core.maps.viewer.scene',
+    'viser': 'splatam_core.maps.viewer.scene',
 }
 MESSAGES = {
     'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'rcl_interfaces', 'rosgraph_msgs',
@@ -64,7 +66,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ('splatam_core.cli',),
     ('splatam_ros.process', 'splatam_ros.throttled_warnings', 'splatam_ros.interface', 'splatam_ros.cameras'),
     ('splatam_ros.subscription',),
-    ('splatam_ros.frames', 'splatam_ros.player'),
+    ('splatam_ros.frames', 'splatam_ros.player', 'splatam_ros.viewer'),
     ('splatam_ros.node',),
     ('splatam_ros.entry', 'splatam_ros.demo', 'splatam_ros.launch'),
 )
@@ -270,6 +272,7 @@ def test_a_cycle_is_seen() -> None:
         ('splatam_core.datasets.record3d', 'def f():\n    import OpenEXR'),
         ('splatam_core.maps.splat', 'import gsply'),
         ('splatam_core.commands.job_runners', 'import distributed'),
+        ('splatam_core.maps.viewer.panel', 'import viser'),
         ('splatam_core.slam', 'def f():\n    import open3d'),
         ('splatam_core.slam', 'import triton'),
         ('splatam_core.slam', 'from splatam_core.rasterizer.triton.rasterizer import TritonRasterizer'),

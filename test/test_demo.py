@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from pathlib import Path
 import pytest
 from domains import reserve_domain
 
+from splatam_core.maps.viewer.browser import find_browser
 from splatam_ros.demo import require_replaceable
 
 DEMO = [sys.executable, '-m', 'splatam_ros.demo']
@@ -70,8 +72,11 @@ def test_the_whole_way(out: Path) -> None:
     metrics = json.loads((out / 'metrics.json').read_text())
     assert metrics['tracked'] == metrics['frames'] == 4
     assert metrics['ate_rmse_m'] < 0.005  # measured 0.2 cm; poses that all stood still would be off by 0.9 cm
-    assert {'report.html', 'report.png', 'map.ply', 'trajectory.txt'} <= {path.name for path in out.iterdir()}
-    assert f'{out}/report.html' in said
+    written = {'report.html', 'report.png', 'map.ply', 'trajectory.txt', *(['viewer.png'] if find_browser() else [])}
+    assert written <= {path.name for path in out.iterdir()}
+    assert ('alt="the map in the viewer"' in (out / 'report.html').read_text()) == bool(find_browser())
+    assert f'{out}/report.html' in said and re.search(r'watch the map grow: http://127\.0\.0\.1:\d+, for this machine only', said)
+    assert len(said.partition('try next:\n')[2].splitlines()) == 3
     assert not alive(out)
     require_replaceable(out)  # by the next run
 
@@ -112,7 +117,7 @@ def test_a_node_that_dies_ends_the_demo_with_its_last_words(out: Path) -> None:
     assert process.returncode == 1
     assert 'was killed by SIGKILL' in said
     assert 'node.log' in said
-    assert not alive(out)
+    wait_until(lambda: not alive(out))  # the viewer notices by itself that the node is gone
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])

@@ -88,7 +88,7 @@ def _shown(row: dict[str, Any]) -> str:
 
 def services() -> str:
     """Returns the table of services."""
-    return table(('service', ''), ((f'`~/{service.name}`', service.help) for service in SERVICES))
+    return table(('service', 'type', ''), ((f'`~/{service.name}`', service.type_name, service.help) for service in SERVICES))
 
 
 def cameras() -> str:

@@ -62,6 +62,16 @@ class GridSettings:
     max_height_m: float = 1.0
     range_m: float = 4.0
 
+    @property
+    def layers(self) -> int:
+        """Number of voxels in a cell's column."""
+        return max(1, round((self.max_height_m - self.min_height_m) / self.resolution_m))
+
+    @property
+    def layer_m(self) -> float:
+        """Height of a voxel."""
+        return (self.max_height_m - self.min_height_m) / self.layers
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthView:
@@ -215,7 +225,26 @@ def rendered_views(
     return views
 
 
-def grid_of(views: Iterable[DepthView], camera: PinholeCamera, T_grid_world: Array, settings: GridSettings) -> Grid:
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalGrid:
+    """What one view says about the voxels in front of it. Voxels lie on the lattice of whole cells of the grid's axes.
+
+    Attributes:
+        low: column and row of the first cell.
+        hits: [rows, columns, layers] whether the view sees a surface in the voxel.
+        passes: [rows, columns, layers] whether it looks through the voxel.
+    """
+
+    low: tuple[int, int]
+    hits: NDArray[np.bool_]
+    passes: NDArray[np.bool_]
+
+
+Window = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""Column and row of the first cell, and one past the last."""
+
+
+def grid_of(views: Sequence[DepthView], camera: PinholeCamera, T_grid_world: Array, settings: GridSettings) -> Grid:
     """Make an occupancy grid of depth images.
 
     Args:
@@ -227,69 +256,120 @@ def grid_of(views: Iterable[DepthView], camera: PinholeCamera, T_grid_world: Arr
     Raises:
         ExportError: nothing is in range, or the grid would be too large.
     """
-    seen = [(view, T_grid_world @ view.T_world_cam) for view in views]
-    eyes = np.array([T_grid_cam[:2, 3] for _, T_grid_cam in seen]).reshape(-1, 2)
-    if not len(eyes):
+    if not len(views):
         raise ExportError('there is no grid: no pose to look from')
-    cell, band = settings.resolution_m, settings.max_height_m - settings.min_height_m
-    low = np.floor((eyes.min(axis=0) - settings.range_m) / cell) * cell
-    columns, rows = (int(n) for n in np.ceil((eyes.max(axis=0) + settings.range_m - low) / cell))
-    layers = max(1, round(band / cell))
-    if columns * rows * layers > MAX_VOXELS:
-        raise ExportError(f'a grid of {columns}x{rows} cells with {layers} layers is too large: choose a larger --resolution')
-    voxels = _Voxels(low, cell, settings, (rows, columns, layers))
-    for view, T_grid_cam in seen:
-        voxels.add(view, T_grid_cam, camera, T_grid_world)
-    return _trimmed(Grid(voxels.cells(), cell, (float(low[0]), float(low[1])), T_grid_world))
+    voxels = Voxels(settings)
+    voxels.reserve([window_of(T_grid_world @ view.T_world_cam, camera, settings) for view in views])
+    for view in views:
+        voxels.add(carve(view, camera, T_grid_world, settings))
+    return voxels.grid(T_grid_world)
 
 
-class _Voxels:
-    """Counts, for each voxel above the grid, the views that hit a surface in it and those that look through it."""
+def window_of(T_grid_cam: Array, camera: PinholeCamera, settings: GridSettings) -> Window:
+    """Return the cells that a camera [4, 4] may see within range: those of the box around its view."""
+    u, v = (np.array([0, size - 1, 0, size - 1]) for size in (camera.width, camera.height))
+    v = v[[0, 0, 1, 1]]
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(4)], axis=1)
+    corners = settings.range_m * rays @ T_grid_cam[:3, :3].T + T_grid_cam[:3, 3]
+    seen = np.vstack([corners, T_grid_cam[:3, 3]])[:, :2] / settings.resolution_m
+    return np.floor(seen.min(axis=0)).astype(np.int64), np.floor(seen.max(axis=0)).astype(np.int64) + 1
 
-    def __init__(self, low: Array, cell: float, settings: GridSettings, shape: tuple[int, int, int]) -> None:
-        self._low, self._cell, self._settings = low, cell, settings
-        self._height = (settings.max_height_m - settings.min_height_m) / shape[2]
-        self._hits, self._passes = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
-        self._floor = np.zeros(shape[:2], np.uint16)
 
-    def add(self, view: DepthView, T_grid_cam: Array, camera: PinholeCamera, T_grid_world: Array) -> None:
-        """Count a view."""
-        world = points_of(view, camera, self._settings.range_m)
-        points = world @ T_grid_world[:3, :3].T + T_grid_world[:3, 3]
-        column, row = (np.floor((points[:, axis] - self._low[axis]) / self._cell).astype(int) for axis in (0, 1))
-        layer = np.floor((points[:, 2] - self._settings.min_height_m) / self._height).astype(int)
+def carve(view: DepthView, camera: PinholeCamera, T_grid_world: Array, settings: GridSettings) -> LocalGrid:
+    """Return what a view says about the voxels in front of it."""
+    T_grid_cam = T_grid_world @ view.T_world_cam
+    low, high = window_of(T_grid_cam, camera, settings)
+    columns, rows = high - low
+    shape = (int(rows), int(columns), settings.layers)
+    world = points_of(view, camera, settings.range_m)
+    points = world @ T_grid_world[:3, :3].T + T_grid_world[:3, 3]
+    column, row = (np.floor(points[:, axis] / settings.resolution_m).astype(np.int64) - low[axis] for axis in (0, 1))
+    layer = np.floor((points[:, 2] - settings.min_height_m) / settings.layer_m).astype(np.int64)
+    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns) & (layer >= 0) & (layer < settings.layers)
+    hits = np.zeros(shape, bool)
+    hits[row[inside], column[inside], layer[inside]] = True
+    passes = np.zeros(shape, bool)
+    T_cam_grid = se3.inverse(T_grid_cam)
+    x, y = (settings.resolution_m * (low[axis] + np.arange(count) + 0.5) for axis, count in ((0, columns), (1, rows)))
+    for layer_index in range(settings.layers):
+        z = settings.min_height_m + (layer_index + 0.5) * settings.layer_m
+        passes[:, :, layer_index] = _looks_through(view, camera, T_cam_grid, (x, y, z), settings)
+    return LocalGrid((int(low[0]), int(low[1])), hits, passes)
+
+
+def _looks_through(
+    view: DepthView, camera: PinholeCamera, T_cam_grid: Array, centres: tuple[Array, Array, float], settings: GridSettings
+) -> NDArray[np.bool_]:
+    """Return [rows, columns] whether a view sees something behind the voxels of a layer with these centres."""
+    x, y, z = centres
+    base = T_cam_grid[:3, 3] + T_cam_grid[:3, 2] * z
+    in_camera = base + T_cam_grid[:3, 0] * x[None, :, None] + T_cam_grid[:3, 1] * y[:, None, None]
+    depth = in_camera[..., 2]
+    with np.errstate(divide='ignore', invalid='ignore'):
+        u = np.rint(in_camera[..., 0] / depth * camera.fx + camera.cx)
+        v = np.rint(in_camera[..., 1] / depth * camera.fy + camera.cy)
+    visible = (depth > 0.1) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    measured = np.zeros_like(depth)
+    measured[visible] = view.depth_m[v[visible].astype(int), u[visible].astype(int)]
+    return visible & (depth <= settings.range_m) & (measured > depth + settings.resolution_m)
+
+
+class Voxels:
+    """Counts, for each voxel above the floor, the views that hit a surface in it and those that look through it."""
+
+    def __init__(self, settings: GridSettings) -> None:
+        self._settings = settings
+        self._low = np.zeros(2, np.int64)
+        self._hits = np.zeros((0, 0, settings.layers), np.uint16)
+        self._passes = np.zeros_like(self._hits)
+
+    def reserve(self, windows: Sequence[Window]) -> None:
+        """Make room for the cells of some windows.
+
+        Raises:
+            ExportError: there would be too many.
+        """
         rows, columns, layers = self._hits.shape
-        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        surface = inside & (layer >= 0) & (layer < layers)
-        _count(self._hits, (row[surface], column[surface], layer[surface]))
-        floor = inside & (layer < 0)
-        _count(self._floor, (row[floor], column[floor]))
-        self._carve(view, T_grid_cam, camera)
+        low = np.min([*([self._low] if rows else []), *(window[0] for window in windows)], axis=0)
+        end = self._low + np.array([columns, rows])
+        high = np.max([*([end] if rows else []), *(window[1] for window in windows)], axis=0)
+        if rows and (low == self._low).all() and (high == end).all():
+            return
+        new_columns, new_rows = (int(size) for size in high - low)
+        if new_columns * new_rows * layers > MAX_VOXELS:
+            raise ExportError(
+                f'a grid of {new_columns}x{new_rows} cells with {layers} layers is too large: choose a larger --resolution'
+            )
+        before, offset, self._low = (self._hits, self._passes), self._low - low, low
+        self._hits, self._passes = (np.zeros((new_rows, new_columns, layers), np.uint16) for _ in range(2))
+        if rows:
+            place = slice(offset[1], offset[1] + rows), slice(offset[0], offset[0] + columns)
+            self._hits[place], self._passes[place] = before
 
-    def _carve(self, view: DepthView, T_grid_cam: Array, camera: PinholeCamera) -> None:
-        """Count the voxels in front of the surface that the view sees."""
-        T_cam_grid = se3.inverse(T_grid_cam)
-        reach = int(np.ceil(self._settings.range_m / self._cell))
-        middle = np.floor((T_grid_cam[:2, 3] - self._low) / self._cell).astype(int)
-        rows, columns, layers = self._hits.shape
-        y = np.arange(max(middle[1] - reach, 0), min(middle[1] + reach, rows))
-        x = np.arange(max(middle[0] - reach, 0), min(middle[0] + reach, columns))
-        centres_x, centres_y = (self._low[axis] + (index + 0.5) * self._cell for axis, index in ((0, x), (1, y)))
-        for layer in range(layers):
-            z = self._settings.min_height_m + (layer + 0.5) * self._height
-            corner = T_cam_grid[:3, 3] + T_cam_grid[:3, 2] * z
-            plane = corner + T_cam_grid[:3, 0] * centres_x[None, :, None] + T_cam_grid[:3, 1] * centres_y[:, None, None]
-            depth = plane[..., 2]
-            with np.errstate(divide='ignore', invalid='ignore'):
-                u = np.rint(plane[..., 0] / depth * camera.fx + camera.cx)
-                v = np.rint(plane[..., 1] / depth * camera.fy + camera.cy)
-            visible = (depth > 0.1) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-            measured = np.zeros_like(depth)
-            measured[visible] = view.depth_m[v[visible].astype(int), u[visible].astype(int)]
-            through = visible & (depth <= self._settings.range_m) & (measured > depth + self._cell)
-            self._passes[y[0] : y[-1] + 1, x[0] : x[-1] + 1, layer] += through
+    def add(self, local: LocalGrid, sign: int = 1) -> None:
+        """Count what a view says; with sign -1, take it back."""
+        rows, columns = local.hits.shape[:2]
+        low = np.array(local.low)
+        self.reserve([(low, low + np.array([columns, rows]))])
+        column, row = low - self._low
+        place = slice(row, row + rows), slice(column, column + columns)
+        for counts, seen in ((self._hits, local.hits), (self._passes, local.passes)):
+            if sign > 0:
+                counts[place] += seen
+            else:
+                counts[place] -= seen
 
-    def cells(self) -> NDArray[np.int8]:
+    def grid(self, T_grid_world: Array) -> Grid:
+        """Return the cells, without unknown margins.
+
+        Raises:
+            ExportError: every cell is unknown.
+        """
+        cell = self._settings.resolution_m
+        origin_m = float(cell * self._low[0]), float(cell * self._low[1])
+        return _trimmed(Grid(self._cells(), cell, origin_m, T_grid_world))
+
+    def _cells(self) -> NDArray[np.int8]:
         """Returns the cells [rows, columns]."""
         hits, passes = self._hits.astype(np.float32), self._passes.astype(np.float32)
         is_surface = (self._hits >= MIN_HITS) & (hits >= MIN_HIT_SHARE * (hits + passes))
@@ -297,11 +377,6 @@ class _Voxels:
         is_free = was_through.mean(axis=2) >= MIN_FREE_SHARE
         cells = np.where(is_free, FREE, UNKNOWN)
         return np.where(is_surface.any(axis=2), OCCUPIED, cells).astype(np.int8)
-
-
-def _count(counts: NDArray[np.uint16], places: tuple[NDArray[np.int64], ...]) -> None:
-    """Adds 1 to each place that a view names, however often it does."""
-    counts.reshape(-1)[np.unique(np.ravel_multi_index(places, counts.shape))] += 1
 
 
 def _trimmed(grid: Grid) -> Grid:

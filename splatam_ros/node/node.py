@@ -90,7 +90,7 @@ class SplatamNode(Node):
             when_full='block' if options.keeps_all else 'drop_oldest', before_frame=self._lifecycle.before_frame,
         )  # fmt: skip
         self._late = self._worker.call(self._outputs.serve_late_subscribers)
-        self._service_server = Services(self, self._worker, self._lifecycle, self._gate)
+        self._service_server = Services(self, self._worker, self._lifecycle, self._outputs, self._gate)
         self._reconfiguration = Reconfiguration(self, options, config, self._use_options, self._use_config)
         self._diagnostics = DiagnosticsPublisher(self, self._sample())
         folder = self._lifecycle.folder
@@ -209,6 +209,7 @@ class SplatamNode(Node):
                 is_fine &= self._attempt('the final fit of the map', partial(self._lifecycle.finish, self._slam, self._stop))
             is_fine &= self._attempt('saving', partial(self._lifecycle.save_at_end, self._slam))
         is_fine &= self._attempt('saving', self._lifecycle.close)
+        is_fine &= self._attempt('the viewer', self._outputs.close)
         self.destroy_node()
         return is_fine
 
@@ -229,7 +230,7 @@ class SplatamNode(Node):
         self._counters.add(result, frame.frame_id, self._slam.graph.summary)
         if result.reason:
             self._warnings.warn(result.status.value, f'{result.status.value} at {stamp_text(result.stamp_ns)}: {result.reason}')
-        self._outputs.publish(result, self._lifecycle.locate(frame, result), self._slam)
+        self._outputs.publish(frame, result, self._lifecycle.locate(frame, result), self._slam)
         if result.T_world_cam is not None:
             self._counters.delay_s = (self.get_clock().now().nanoseconds - result.stamp_ns) / 1e9
         self._log_progress(result)

@@ -18,11 +18,14 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from msg_adapters import images, markers, point_clouds, poses, stamps
 from msg_adapters.factory import MessageFactory, RclpyMessages, message_class
 from splatam_core.slam import Slam
-from splatam_core.types import FrameResult, RenderedView
+from splatam_core.types import FrameResult, RenderedView, RgbdFrame
 from splatam_ros.frames.covariance import Motion, MotionEstimator
 from splatam_ros.frames.rep105 import Located
 from splatam_ros.frames.robot_frames import RobotFrames
+from splatam_ros.node.floor_plan import FloorPlan
 from splatam_ros.node.parameters import NodeOptions
+from splatam_ros.throttled_warnings import ThrottledWarnings
+from splatam_ros.viewer.feed import ViewerFeed
 
 Matrix = NDArray[np.float64]
 
@@ -54,8 +57,10 @@ class PublishContext:
         motion: velocity and covariances.
         slam: SLAM in its state after the frame; the map may be rendered.
         path: all tracked poses so far.
+        floor_plan: makes the occupancy grid.
         options: the node's options.
         factory: makes the messages.
+        is_idle: whether no frame waits, so that a message may take its time.
     """
 
     located: Located
@@ -63,8 +68,10 @@ class PublishContext:
     motion: Motion
     slam: Slam
     path: PathHistory
+    floor_plan: FloorPlan
     options: NodeOptions
     factory: MessageFactory
+    is_idle: bool = False
 
     @property
     def stamp_ns(self) -> int:
@@ -175,6 +182,12 @@ def _cloud(context: PublishContext) -> Any:
     return point_clouds.cloud_message(context.factory, points, rgb, context.stamp_ns, context.map_frame, extra)
 
 
+def _grid(context: PublishContext) -> Any:
+    return context.floor_plan.message(
+        context.slam, context.located, context.options, context.factory, is_complete=context.is_idle
+    )  # fmt: skip
+
+
 def _path_rate(options: NodeOptions) -> float:
     return options.publish_rate_path
 
@@ -185,6 +198,10 @@ def _render_rate(options: NodeOptions) -> float:
 
 def _cloud_rate(options: NodeOptions) -> float:
     return options.publish_rate_cloud
+
+
+def _grid_rate(options: NodeOptions) -> float:
+    return options.publish_rate_grid
 
 
 OUTPUTS = (
@@ -207,6 +224,8 @@ OUTPUTS = (
     Output('map/points', 'sensor_msgs/msg/PointCloud2', LATCHED_QOS, Trigger.SUBSCRIBED, _cloud,
            'centres of the Gaussians with x y z rgb opacity radius, thinned out evenly beyond `max_cloud_points`; latched',
            rate_hz=_cloud_rate),
+    Output('map/grid', 'nav_msgs/msg/OccupancyGrid', LATCHED_QOS, Trigger.SUBSCRIBED, _grid,
+           'floor plan: free, occupied or unknown, seen from above; latched; see below', rate_hz=_grid_rate),
 )  # fmt: skip
 
 
@@ -270,6 +289,9 @@ class Outputs:
             node: the node that publishes.
             options: the node's options.
             frames: publish the transforms.
+
+        Raises:
+            ViewerError: the viewer is wanted, and not installed.
         """
         self.num_poses = 0
         self._node = node
@@ -278,6 +300,10 @@ class Outputs:
         self._factory = RclpyMessages()
         self._publishers = [(output, self._create(output.type_name, output.topic, output.qos)) for output in OUTPUTS]
         self._processed = self._create('std_msgs/msg/Header', 'processed', POSE_QOS)
+        self._floor_plan = FloorPlan(ThrottledWarnings(node.get_logger()))
+        self._viewer: ViewerFeed | None = None
+        if options.viewer_port:
+            self._viewer = ViewerFeed.start(options.viewer_host, options.viewer_port, node.get_logger())
         self.begin_map()
 
     def use(self, options: NodeOptions) -> None:
@@ -292,19 +318,23 @@ class Outputs:
         self._due_s: dict[str, float] = {}
         self._published_ns: dict[str, int] = {}
         self._frames.begin_map()
+        self._floor_plan.begin_map()
+        if self._viewer is not None:
+            self._viewer.begin_map()
 
     def interrupt_motion(self) -> None:
         """Report no velocity between the last pose and the next one, e.g. because time jumped."""
         self._motion.interrupt()
 
-    def publish(self, result: FrameResult, located: Located | None, slam: Slam) -> None:
+    def publish(self, frame: RgbdFrame, result: FrameResult, located: Located | None, slam: Slam) -> None:
         """Publish what is due for a frame, all with its stamp.
 
         An uncertain frame goes to the topics that carry covariances; a lost one to none. For both the transform from map
         to odom stays what it was, with the new stamp, so that a robot with odometry can go on.
 
         Args:
-            result: result of the frame.
+            frame: the frame.
+            result: its result.
             located: its camera in the coordinate frames of ROS; None if that is not known.
             slam: SLAM in its state after the frame.
         """
@@ -315,6 +345,8 @@ class Outputs:
         if not result.status.is_trusted and self._node.context.ok():
             self._frames.hold(result.stamp_ns)
         self.publish_processed(result.stamp_ns)
+        if self._viewer is not None:
+            self._viewer.take(frame, result, slam)
 
     def publish_processed(self, stamp_ns: int) -> None:
         """Announce on ``~/processed`` that nothing more will be published for the frame of this stamp."""
@@ -323,8 +355,10 @@ class Outputs:
 
     @property
     def has_late_subscriber(self) -> bool:
-        """True if a latched topic has a subscriber but its newest message was not published."""
+        """True if a latched topic has a subscriber but its newest message was not published, or the viewer asks for something."""
         newest, now_s = self._newest, time.monotonic()
+        if self._viewer is not None and self._viewer.is_asked:
+            return True
         return newest is not None and any(
             output.qos is LATCHED_QOS
             and self._published_ns.get(output.topic) != newest.stamp_ns
@@ -333,9 +367,23 @@ class Outputs:
         )
 
     def serve_late_subscribers(self, slam: Slam) -> None:
-        """Publish the newest message of each latched topic that someone subscribed to after the last frame."""
+        """Publish the newest message of each latched topic that someone subscribed to after the last frame; answer the viewer."""
+        if self._viewer is not None:
+            self._viewer.answer(slam)
         if self._newest is not None and self._node.context.ok() and self.has_late_subscriber:
+            self._newest.is_idle = True
             self._publish_due(self._newest, [row for row in self._publishers if row[0].qos is LATCHED_QOS])
+
+    def occupancy_grid(self, slam: Slam) -> Any:
+        """Return the grid of all keyframes as a message; None, after a warning, if there is none."""
+        if self._newest is None:
+            return None
+        return self._floor_plan.message(slam, self._newest.located, self._options, self._factory, is_complete=True)
+
+    def close(self) -> None:
+        """End the viewer."""
+        if self._viewer is not None:
+            self._viewer.close()
 
     def _publish_pose(self, located: Located, T_world_cam: Matrix, result: FrameResult, slam: Slam) -> None:
         context = PublishContext(
@@ -344,6 +392,7 @@ class Outputs:
             motion=self._motion.observe(located, result),
             slam=slam,
             path=self._path,
+            floor_plan=self._floor_plan,
             options=self._options,
             factory=self._factory,
         )
@@ -363,7 +412,9 @@ class Outputs:
                 rate_hz = output.rate_hz(self._options)
                 self._due_s[output.topic] = now_s + (1 / rate_hz if rate_hz else 0.0)
                 self._published_ns[output.topic] = context.stamp_ns
-                publisher.publish(output.message(context))
+                message = output.message(context)
+                if message is not None:
+                    publisher.publish(message)
 
     def _create(self, type_name: str, topic: str, qos: QoSProfile) -> Publisher:
         return self._node.create_publisher(message_class(type_name), f'~/{topic}', qos)

@@ -22,6 +22,7 @@ from rclpy.node import Node
 from msg_adapters.synchronizer import Mode
 from splatam_core.config import SlamConfig, flat_values, load_config, settings
 from splatam_core.errors import ConfigError, one_line
+from splatam_core.maps.grid import GridSettings
 from splatam_core.settings import Setting, Value, shown
 from splatam_ros.frames.options import FrameOptions
 
@@ -128,6 +129,18 @@ NODE_SETTINGS: tuple[Setting, ...] = (
              1000.0),
     _setting('publish_rate.cloud', 1.0, 'Largest rate of ~/map/points; 0 = with every pose. Decrease when the '
              'network is slow.', 'Hz', 0.0, 1000.0),
+    _setting('publish_rate.grid', 1.0, 'Largest rate of ~/map/grid; 0 = with every pose. Decrease to save time.', 'Hz', 0.0,
+             1000.0),
+    _setting('grid.resolution', 0.05, 'Side of a cell of ~/map/grid. Increase for large halls and slow machines.', 'm', 0.01, 1.0),
+    _setting('grid.min_height', 0.1, 'Lowest height over the floor (over the base, if base_frame is set) at which something is an '
+             'obstacle. Increase when an uneven floor shows as obstacles.', 'm', -10.0, 100.0),
+    _setting('grid.max_height', 1.0, 'Highest such height: that of the robot. Increase for a taller robot.', 'm', -10.0, 100.0),
+    _setting('grid.range', 4.0, 'Depth beyond this adds nothing to the grid. Increase when depth is precise far away.', 'm', 0.5,
+             100.0),
+    _setting('viewer.port', 0, 'Port of a web page that shows the map while it grows, the next free one if it is taken; 0 = off. '
+             "Set it to watch. Needs pip install 'splatam_ros[viewer]'.", '', 0, 65535),
+    _setting('viewer.host', '127.0.0.1', 'Address that the page listens on. 127.0.0.1 is for this machine only; 0.0.0.0 shows the '
+             'page, without a password, to everybody who reaches the machine.'),
     _setting('no_data_timeout', 5.0, 'Warn, with the reason, when no frame was received for this long; 0 = never. Increase when '
              'the camera often pauses.', 's', 0.0,
              3600.0),
@@ -182,6 +195,13 @@ class NodeOptions:
     publish_rate_path: float
     publish_rate_render: float
     publish_rate_cloud: float
+    publish_rate_grid: float
+    grid_resolution: float
+    grid_min_height: float
+    grid_max_height: float
+    grid_range: float
+    viewer_port: int
+    viewer_host: str
     no_data_timeout: float
     exit_on_publisher_end: bool
 
@@ -198,6 +218,11 @@ class NodeOptions:
     def keeps_all(self) -> bool:
         """True if every frame is processed, False if old frames are dropped when SLAM is slower than the camera."""
         return self.queue_policy == 'all'
+
+    @property
+    def grid(self) -> GridSettings:
+        """What the occupancy grid shows."""
+        return GridSettings(self.grid_resolution, self.grid_min_height, self.grid_max_height, self.grid_range)
 
     @property
     def frames(self) -> FrameOptions:
@@ -247,6 +272,10 @@ def check_options(options: NodeOptions) -> None:
         as_path(name, getattr(options, name))
     if 0 < options.width < MIN_WIDTH:
         raise ConfigError(f'width = {options.width}: expected 0 (keep the size), or at least {MIN_WIDTH} (px)')
+    if options.grid_min_height >= options.grid_max_height:
+        raise ConfigError(
+            f'grid.min_height = {options.grid_min_height:g} is not below grid.max_height = {options.grid_max_height:g}'
+        )
 
 
 def field_name(name: str) -> str:
@@ -258,12 +287,15 @@ def field_name(name: str) -> str:
 CHANGEABLE = frozenset({
     'save_path', 'save_on_shutdown', 'finish_limit', 'load_path', 'load_pose', 'on_time_jump', 'on_camera_change',
     'lost_reset_after', 'max_rate_hz', 'max_cloud_points', 'publish_rate.path', 'publish_rate.render', 'publish_rate.cloud',
+    'publish_rate.grid', 'grid.resolution', 'grid.min_height', 'grid.max_height', 'grid.range',
     'no_data_timeout', 'exit_on_publisher_end',
 })  # fmt: skip
 FIXED = {
     'preset': 'all other settings start from it; change those below slam.',
     'save_root': 'it limits what may be changed',
     'width': 'frames of another size belong to another camera',
+    'viewer.port': 'the viewer is started with the node',
+    'viewer.host': 'the viewer is started with the node',
     'max_path_poses': 'the existing path is thinned out by it',
     'slam.seed': 'it seeds the random numbers of this map when the map starts',
     'slam.width': "it is for 'splatam run'; the node's parameter is width",

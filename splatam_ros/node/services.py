@@ -1,12 +1,13 @@
-"""The node's services, all of type ``std_srvs/Trigger``. Those that touch the map run on the worker's thread."""
+"""The node's services, of type ``std_srvs/Trigger`` but for ``~/get_map``. Those that touch the map run on the worker's thread."""
 
 from __future__ import annotations
 
 import traceback
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
+from nav_msgs.srv import GetMap
 from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
@@ -18,6 +19,7 @@ from splatam_ros.node.attempt import why
 from splatam_ros.node.gate import FrameGate
 from splatam_ros.node.initial_pose import InitialPose
 from splatam_ros.node.map_lifecycle import MapLifecycle
+from splatam_ros.node.outputs import Outputs
 
 
 @dataclass(frozen=True)
@@ -27,10 +29,12 @@ class Service:
     Attributes:
         name: name below the node's name.
         help: one line for the documentation.
+        type_name: type of the service.
     """
 
     name: str
     help: str
+    type_name: str = 'std_srvs/srv/Trigger'
 
 
 SERVICES = (
@@ -44,6 +48,11 @@ SERVICES = (
         'continue in the map at `load_path` from `load_pose`, or without it wherever the camera recognises a keyframe of the '
         'map; with `slam.mapping.enabled` off only localize',
     ),
+    Service(
+        'get_map',
+        'the newest floor plan, as on `~/map/grid`, of all keyframes; an empty one if there is none',
+        'nav_msgs/srv/GetMap',
+    ),
 )
 
 
@@ -56,7 +65,7 @@ class FinishedCall(Protocol):
     def exception(self) -> BaseException | None:
         """Returns the exception of the call, if it failed."""
 
-    def result(self) -> str:
+    def result(self) -> Any:
         """Returns the result of the call."""
 
 
@@ -66,10 +75,11 @@ class Services:
     A failure is answered with ``success`` false and the reason; it never ends the node.
     """
 
-    def __init__(self, node: Node, worker: SlamWorker, lifecycle: MapLifecycle, gate: FrameGate) -> None:
+    def __init__(self, node: Node, worker: SlamWorker, lifecycle: MapLifecycle, outputs: Outputs, gate: FrameGate) -> None:
         self._node = node
         self._worker = worker
         self._lifecycle = lifecycle
+        self._outputs = outputs
         self._gate = gate
         actions: dict[str, Callable[[], Awaitable[Trigger.Response]]] = {
             'reset': self._reset,
@@ -79,8 +89,9 @@ class Services:
             'optimize': self._optimize,
             'load_map': self._load_map,
         }
-        for service in SERVICES:
-            node.create_service(Trigger, f'~/{service.name}', _handler(actions[service.name]))
+        for name, action in actions.items():
+            node.create_service(Trigger, f'~/{name}', _handler(action))
+        node.create_service(GetMap, '~/get_map', self._get_map)
         self._initial_pose = InitialPose(node, worker, lifecycle)
 
     async def _reset(self) -> Trigger.Response:
@@ -105,6 +116,14 @@ class Services:
 
     async def _load_map(self) -> Trigger.Response:
         return await self._on_worker(self._lifecycle.load)
+
+    async def _get_map(self, request: GetMap.Request, response: GetMap.Response) -> GetMap.Response:
+        answer = Future()
+        self._worker.call(self._outputs.occupancy_grid).add_done_callback(answer.set_result)
+        done: FinishedCall = await answer
+        if not done.cancelled() and done.exception() is None and (grid := done.result()) is not None:
+            response.map = grid
+        return response
 
     def _reset_slam(self, slam: Slam) -> str:
         return self._lifecycle.reset(slam, 'requested by ~/reset')

@@ -17,6 +17,8 @@ from splatam_core.datasets.room import ROOM_SIZE_M, build_room, furniture
 from splatam_core.datasets.synthetic import CAMERA, SyntheticSequence, measured
 from splatam_core.errors import ExportError
 from splatam_core.geometry import se3
+from splatam_core.images.view import View
+from splatam_core.mapping.posed import PosedView
 from splatam_core.maps.grid import (
     FREE,
     OCCUPIED,
@@ -31,6 +33,7 @@ from splatam_core.maps.grid import (
     upright,
     write_map_server,
 )  # fmt: skip
+from splatam_core.maps.keyframe_grid import KeyframeGrid
 from splatam_core.rasterizer import Gaussians, make_rasterizer
 
 WIDTH, VIEWS, STEP = 160, 30, 4  # a full turn
@@ -131,6 +134,48 @@ def test_the_plan_is_that_of_the_room(tilt_deg: float) -> None:
     assert seen_known_share(grid, look) >= 0.9
     inside = (grid.cells != UNKNOWN).sum() * grid.resolution_m**2
     assert 10 < inside < ROOM_SIZE_M[0] * ROOM_SIZE_M[1] * 1.1  # square metres
+
+
+def keyframes(look: Look, T_world_error: NDArray[np.float64] | None = None) -> list[PosedView]:
+    """The views as keyframes; the later half is displaced by an error, as before a loop is closed."""
+    found = []
+    for index, view in enumerate(look.views):
+        is_wrong = T_world_error is not None and index >= len(look.views) // 2
+        T_world_cam = T_world_error @ view.T_world_cam if is_wrong else view.T_world_cam
+        rgb8 = torch.zeros(CAM.height, CAM.width, 3, dtype=torch.uint8)
+        found.append(PosedView.at(View(CAM, rgb8, torch.from_numpy(view.depth_m)), se3.inverse(T_world_cam), 5 * index))
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('tilt_deg', [0, 20])
+def test_the_plan_of_keyframes_is_that_of_the_room_also_after_a_correction(tilt_deg: float) -> None:
+    look = look_around(tilt_deg)
+    T_grid_world = find_floor(look.views, CAM, SETTINGS.range_m)
+    T_room_grid = look.T_room_world @ se3.inverse(T_grid_world)
+    plan = KeyframeGrid(T_grid_world, SETTINGS)
+    T_grid_error = se3.exp(np.array([0.4, -0.3, 0.08, 0, 0, np.radians(15)]))  # of the grid's axes: upright, as tracking keeps it
+    T_world_error = se3.inverse(T_grid_world) @ T_grid_error @ T_grid_world
+    wrong, right = keyframes(look, T_world_error), keyframes(look)
+    while plan.update(wrong, most=7):  # a few at a time
+        pass
+    assert right_share(plan.grid(), T_room_grid) < 0.9  # walls are there twice
+    assert plan.update(right, most=100) and not plan.update(right, most=100)
+    corrected = plan.grid()
+    assert right_share(corrected, T_room_grid) >= 0.97
+    assert seen_known_share(corrected, look) >= 0.9
+    assert not plan.update(right[:3], most=100)  # what the map has dropped stays
+
+
+def test_a_keyframe_that_sees_nothing_new_is_left_out() -> None:
+    view = DepthView(np.full((CAM.height, CAM.width), 2.0, np.float32), np.eye(4))
+    (keyframe,) = keyframes(Look([view], np.eye(4)))
+    T_grid_world = upright(np.array([0, -1.0, 0]), np.array([0, 1.2, 0]), np.eye(4))
+    plan = KeyframeGrid(T_grid_world, SETTINGS)
+    near = [PosedView.at(keyframe.view, se3.exp(np.array([0.02 * n, 0, 0, 0, 0.02, 0])), n) for n in (1, 2, 3)]
+    assert plan.update([keyframe, near[0]], most=5)  # a surface must be seen twice
+    assert (plan.grid().cells == OCCUPIED).any()
+    assert not plan.update([keyframe, *near], most=5)
 
 
 def test_the_axes_are_upright_and_point_where_the_first_camera_looks() -> None:

@@ -296,7 +296,7 @@ def test_what_costs_is_made_for_listeners_only_and_at_its_rate(
         frame = replace(frames[0], stamp_ns=stamp_ns, frame_id=CAMERA_FRAME)
         assert result.T_world_cam is not None
         located = robot_frames.locate(frame, result.T_world_cam, None)
-        outputs.publish(replace(result, stamp_ns=stamp_ns), located, slam)
+        outputs.publish(frame, replace(result, stamp_ns=stamp_ns), located, slam)
         made = {'render': slam.renders, 'map': slam.snapshots}
         graph.spin_until(lambda: all(len(heard[topic]) == made.get(topic.split('/')[0], len(heard[topic])) for topic in heard))
 
@@ -403,6 +403,7 @@ def test_what_was_recorded_of_the_node_plays_back(graph: Graph, tf_message: type
 
 SHOWS = {
     'rviz_default_plugins/PointCloud2': 'sensor_msgs/msg/PointCloud2',
+    'rviz_default_plugins/Map': 'nav_msgs/msg/OccupancyGrid',
     'rviz_default_plugins/Path': 'nav_msgs/msg/Path',
     'rviz_default_plugins/MarkerArray': 'visualization_msgs/msg/MarkerArray',
     'rviz_default_plugins/Pose': 'geometry_msgs/msg/PoseStamped',

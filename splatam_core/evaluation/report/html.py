@@ -26,10 +26,12 @@ from splatam_core.evaluation.report.tables import environment
 from splatam_core.evaluation.report.theme import DARK, LIGHT, Theme
 from splatam_core.evaluation.results import Evaluation, Sample
 from splatam_core.runs import provenance
+from splatam_core.runs.layout import VIEWER_PICTURE
 from splatam_core.runs.metrics import Metrics
 
 TEMPLATE = 'page.html'
 JPEG_QUALITY = 88
+MAX_PICTURE_BYTES = 1 << 24
 Draw = Callable[[Figure, Evaluation, Theme], None]
 
 
@@ -91,6 +93,7 @@ def html_report(evaluation: Evaluation) -> str:
     return environment().get_template(TEMPLATE).render(
         title=evaluation.run.path.resolve().name,
         subtitle=subtitle(evaluation),
+        opening=_opening(evaluation.run.path / VIEWER_PICTURE),
         light=asdict(LIGHT),
         dark=asdict(DARK),
         headline=headline(evaluation),
@@ -105,6 +108,14 @@ def html_report(evaluation: Evaluation) -> str:
         settings=list(_settings(evaluation)),
         provenance=_provenance(evaluation),
     )  # fmt: skip
+
+
+def _opening(path: Path) -> str | None:
+    """Returns the address of the picture of the viewer; None if there is none."""
+    if not path.is_file() or not 0 < path.stat().st_size <= MAX_PICTURE_BYTES:
+        return None
+    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
+    return None if image is None else _jpeg(np.asarray(image[:, :, ::-1], np.uint8))
 
 
 # --- charts ---

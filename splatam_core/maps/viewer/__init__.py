@@ -1,0 +1,1 @@
+"""Shows a map in a browser: Gaussians, camera, trajectories, and controls."""
