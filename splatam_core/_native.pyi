@@ -113,6 +113,18 @@ class LinearSystem:
     @property
     def depth_median(self) -> float: ...
 
+class EvidenceSums:
+    """See ``tracking.aligner.EvidenceSums``."""
+
+    @property
+    def claimed(self) -> NDArray[np.float64]: ...
+    @property
+    def shared(self) -> NDArray[np.float64]: ...
+    @property
+    def scores(self) -> NDArray[np.float64]: ...
+    @property
+    def cells(self) -> NDArray[np.float64]: ...
+
 class Aligner:
     """See ``tracking.aligner.Aligner``. Layers have two more channels of padding."""
 
@@ -138,6 +150,24 @@ class Aligner:
         inlier_color: float,
         inlier_depth: float,
     ) -> LinearSystem: ...
+    def evidence(
+        self,
+        brightness: Floats,
+        depth: Floats,
+        layers: Floats,
+        *,
+        camera: PinholeCamera,
+        color_motion: Floats,
+        depth_motion: Floats,
+        velocity: Floats,
+        gain: float,
+        bias: float,
+        photometric_scale: float,
+        depth_scale: float,
+        max_depth_ratio: float,
+        max_depth_error: float,
+        step: int,
+    ) -> EvidenceSums: ...
 
 def solve_blocks(place: NDArray[np.int32], blocks: Doubles, right_hand_side: Doubles) -> None:
     """Solves a sparse symmetric system of 6x6 blocks; the solution [N, 6] replaces the right-hand side.

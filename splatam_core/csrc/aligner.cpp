@@ -82,6 +82,25 @@ Aligner::Result Aligner::linearize(const float* brightness, const float* depth, 
   return {sums[0], median(histograms[0].photometric), median(histograms[0].depth)};
 }
 
+Aligner::Evidence Aligner::evidence(const Aligned& images) {
+  std::vector<EvidenceSums> sums(kCellRows);
+  pool_.run(threads_, kCellRows, [&](std::size_t row, int) { sum_evidence(images, int(row), sums[row]); });
+  Evidence total{};
+  for (int row = 0; row < kCellRows; ++row) {
+    for (int i = 0; i < kUnknowns; ++i) {
+      for (int k = 0; k < kUnknowns; ++k)
+        total.claimed[i][k] += sums[row].claimed[i][k], total.shared[i][k] += sums[row].shared[i][k];
+      std::copy_n(sums[row].scores[i], kCellColumns, total.scores[i] + row * kCellColumns);
+    }
+    for (int column = 0; column < kCellColumns; ++column) {
+      double of_cell[kCellSums];
+      std::memcpy(of_cell, &sums[row].cells[column], sizeof of_cell);
+      for (int i = 0; i < kCellSums; ++i) total.cells[i][row * kCellColumns + column] = of_cell[i];
+    }
+  }
+  return total;
+}
+
 void Aligner::halve(const float* brightness, const float* depth, int width, int height, float max_step,
                     float* half_brightness, float* half_depth) {
   const int columns = width / 2;

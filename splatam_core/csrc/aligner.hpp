@@ -4,6 +4,7 @@
 
 #include <vector>
 
+#include "evidence.hpp"
 #include "kernels.hpp"
 #include "thread_pool.hpp"
 
@@ -23,6 +24,13 @@ class Aligner {
   // Linearises the residuals.
   Result linearize(const float* brightness, const float* depth, const Camera&, const float* layers,
                    const Pose& color_motion, const Pose& depth_motion, const AlignmentSettings&);
+
+  // Sums what the residuals say about the pose.
+  struct Evidence {
+    double claimed[kUnknowns][kUnknowns], shared[kUnknowns][kUnknowns];
+    double scores[kUnknowns][kCells], cells[kCellSums][kCells];  // see EvidenceSums; cells row by row
+  };
+  Evidence evidence(const Aligned&);
 
   // Halves the size: each pixel is the mean of a 2x2 block. Depth is NaN where the block spans a depth edge.
   void halve(const float* brightness, const float* depth, int width, int height, float max_step, float* half_brightness,

@@ -198,6 +198,42 @@ LinearSystem linearize(Aligner& aligner, const py::object& brightness, const py:
           result.depth_median};
 }
 
+// Aligner::Evidence as Python sees it.
+struct EvidenceOfView {
+  py::array_t<double> claimed, shared, scores, cells;
+};
+
+template <std::size_t rows, std::size_t columns>
+py::array_t<double> matrix(const double (&entries)[rows][columns]) {
+  return py::array_t<double>({rows, columns}, &entries[0][0]);
+}
+
+EvidenceOfView evidence(Aligner& aligner, const py::object& brightness, const py::object& depth,
+                        const py::object& layers, const py::object& camera, const py::object& color_motion,
+                        const py::object& depth_motion, const py::object& velocity, float gain, float bias,
+                        float photometric_scale, float depth_scale, float max_depth_ratio, float max_depth_error,
+                        int step) {
+  const GivenLevel level = level_of(brightness, depth);
+  if (step < 1) throw py::value_error("step is " + std::to_string(step) + "; expected at least 1");
+  const float* v = values<float>(velocity, "velocity", {6});
+  const Aligned images{
+      level.brightness,
+      level.depth,
+      values<float>(layers, "layers", {level.size.height, level.size.width, kLayers}),
+      camera_of(camera, level.size),
+      pose_of(color_motion, "color_motion"),
+      pose_of(depth_motion, "depth_motion"),
+      {gain, bias, {v[0], v[1], v[2], v[3], v[4], v[5]}, photometric_scale, depth_scale, max_depth_ratio, 0.0f, 0.0f},
+      max_depth_error,
+      step};
+  Aligner::Evidence found;
+  {
+    py::gil_scoped_release release;
+    found = aligner.evidence(images);
+  }
+  return {matrix(found.claimed), matrix(found.shared), matrix(found.scores), matrix(found.cells)};
+}
+
 py::tuple halve(Aligner& aligner, const py::object& brightness, const py::object& depth, float max_step) {
   const GivenLevel level = level_of(brightness, depth);
   const int width = int(level.size.width), height = int(level.size.height);
@@ -284,6 +320,11 @@ void bind_aligner(py::module_& module) {
       .def_readonly("agreeing", &LinearSystem::agreeing)
       .def_readonly("photometric_median", &LinearSystem::photometric_median)
       .def_readonly("depth_median", &LinearSystem::depth_median);
+  py::class_<EvidenceOfView>(module, "EvidenceSums")
+      .def_readonly("claimed", &EvidenceOfView::claimed)
+      .def_readonly("shared", &EvidenceOfView::shared)
+      .def_readonly("scores", &EvidenceOfView::scores)
+      .def_readonly("cells", &EvidenceOfView::cells);
   py::class_<Aligner>(module, "Aligner")
       .def(py::init([](int threads) { return std::make_unique<Aligner>(checked_threads(threads)); }),
            py::arg("threads"))
@@ -291,6 +332,10 @@ void bind_aligner(py::module_& module) {
            py::arg("camera"), py::arg("color_motion"), py::arg("depth_motion"), py::arg("velocity"), py::arg("gain"),
            py::arg("bias"), py::arg("photometric_scale"), py::arg("depth_scale"), py::arg("max_depth_ratio"),
            py::arg("inlier_color"), py::arg("inlier_depth"))
+      .def("evidence", &evidence, py::arg("brightness"), py::arg("depth"), py::arg("layers"), py::kw_only(),
+           py::arg("camera"), py::arg("color_motion"), py::arg("depth_motion"), py::arg("velocity"), py::arg("gain"),
+           py::arg("bias"), py::arg("photometric_scale"), py::arg("depth_scale"), py::arg("max_depth_ratio"),
+           py::arg("max_depth_error"), py::arg("step"))
       .def("halve", &halve, py::arg("brightness"), py::arg("depth"), py::arg("max_step"))
       .def("fill_holes", &fill_holes, py::arg("depth"), py::arg("max_gap"), py::arg("max_step"))
       .def("layers", &layers, py::arg("brightness"), py::arg("depth"), py::arg("max_step"));

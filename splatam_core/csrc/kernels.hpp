@@ -92,7 +92,7 @@ struct AdamRates {
   float means, log_scales, logit_opacities, rgb;
 };
 
-constexpr int kFloatsPerFootprint = 32;  // size of a Footprint, see kernels.inl
+constexpr int kFloatsPerFootprint = 17;  // size of a Footprint and of the groups it reaches, see kernels.inl
 
 struct TileList {
   int x, y;  // pixel of its upper left corner

@@ -95,18 +95,16 @@ struct Corner {
 
 static inline Corner corner(const TileList& tile) { return {uniform_of_int(tile.x), uniform_of_int(tile.y)}; }
 
-// A splat within one tile: its offsets, and the two separable factors of its alpha (per column, per row).
+// A splat within one tile: the two separable factors of its alpha (per column, per row).
 struct Footprint {
-  Lanes dx, across;
-  float dy[8], down[8];
+  Lanes across;
+  float down[8];
 };
 
 static inline Footprint footprint(const Splat& s, const Corner& tile) {
   Footprint f;
-  f.dx = iota() + (tile.x - uniform(s.u));
-  const Lanes dy = iota() + (tile.y - uniform(s.v));
-  f.across = exp(f.dx * f.dx * s.falloff);
-  store(f.dy, dy);
+  const Lanes dx = iota() + (tile.x - uniform(s.u)), dy = iota() + (tile.y - uniform(s.v));
+  f.across = exp(dx * dx * s.falloff);
   store(f.down, s.opacity * exp(dy * dy * s.falloff));
   return f;
 }
@@ -118,17 +116,23 @@ static inline IntLanes on_image(const TileList& tile, const Camera& camera, int 
 
 constexpr int kGroups = kTile / kRows;  // of rows that are blended at once
 
-// Returns whether every pixel of a tile is saturated. Group is Pixels or PixelGradients. Call it at least every 16
+// Groups of rows, as a bit for each at its first row.
+typedef std::uint32_t Groups;
+constexpr Groups kAllGroups = kRows == 1 ? 0xff : 0x55;
+
+static inline Groups groups_of(Groups rows) { return kRows == 1 ? rows : (rows | rows >> 1) & kAllGroups; }
+
+// Returns the groups with a pixel that is not saturated. Group is Pixels or PixelGradients. Call it at least every 16
 // splats: it also resets the transmittance of saturated pixels, before that becomes a denormal number.
 template <typename Group>
-static inline bool opaque(Group* rows) {
-  IntRows open{};
+static inline Groups open_groups(Group* rows) {
+  Groups open = 0;
   for (int i = 0; i < kGroups; ++i) {
     const IntRows more = rows[i].T >= kMinTransmittance;
     rows[i].T = either(more, rows[i].T, repeated(splat(0.5f * kMinTransmittance)));
-    open |= more;
+    open |= Groups(any(more)) << kRows * i;
   }
-  return !any(open);
+  return open;
 }
 
 static inline int columns_of(const TileList& tile, const Camera& camera) {
@@ -179,6 +183,7 @@ struct Values {
 
 static inline Values values_of(const Splat& s) { return {uniform(s.r), uniform(s.g), uniform(s.b), uniform(s.z)}; }
 
+template <bool kSilhouette>
 static inline void blend(Pixels& pixels, Rows raw_alpha, const Values& s) {
   const Rows alpha = keep(raw_alpha >= kMinAlpha, min(raw_alpha, kMaxAlpha));
   const Rows w = keep(pixels.T >= kMinTransmittance, alpha * pixels.T);
@@ -186,7 +191,7 @@ static inline void blend(Pixels& pixels, Rows raw_alpha, const Values& s) {
   pixels.g += w * s.g;
   pixels.b += w * s.b;
   pixels.depth += w * s.z;
-  pixels.silhouette += w;
+  if (kSilhouette) pixels.silhouette += w;
   pixels.T *= 1.0f - alpha;  // also in saturated pixels: the shortest path to the next splat's T
 }
 
@@ -205,30 +210,36 @@ constexpr std::size_t kBatch = 16;
 // Returns the lanes of the rows of a tile in which a splat reaches a pixel.
 static inline IntLanes reached_rows(const Footprint& f) { return load(f.down) * highest(f.across) >= kMinAlpha; }
 
-// Returns, for each group of rows, the splats of a batch that reach it, as a bit per splat.
-static inline void find_reached(const Footprint* footprints, std::size_t size, std::uint32_t* reached) {
-  static_assert(kRows == 1 || !kSkipRows, "a group of several rows is reached where one of them is");
-  if constexpr (kSkipRows) {
-    IntLanes by_row{};
-    for (std::size_t k = 0; k < size; ++k) by_row |= reached_rows(footprints[k]) & (1 << k);
-    __builtin_memcpy(reached, &by_row, sizeof by_row);
+// Up to kBatch splats in a tile, and the groups of rows that each reaches.
+struct Batch {
+  std::size_t size;
+  const Footprint* footprints;
+  Values values[kBatch];
+  std::int32_t reached[8];  // the splats that reach a row, as a bit per splat
+};
+
+// Finds where the splats of a batch are seen: the groups that they reach and that are open. Writes them to `groups`
+// unless it is null.
+static inline void find_reached(Batch& batch, Groups open, std::uint8_t* groups) {
+  IntLanes by_row{};
+  for (std::size_t k = 0; k < batch.size; ++k) {
+    const IntLanes rows = reached_rows(batch.footprints[k]);
+    by_row |= rows & (1 << k);
+    if (groups) groups[k] = std::uint8_t(groups_of(bits_of_mask(rows)) & open);
   }
+  store(batch.reached, by_row);
 }
 
-// Blends up to kBatch splats into a tile, group of rows by group, so that the pixels stay in registers. Rows that a
-// splat does not reach are skipped only where the blending of one takes longer than a mispredicted branch.
-static inline void blend(Pixels* pixels, const Values* batch, const Footprint* footprints, std::size_t size) {
-  std::uint32_t reached[kGroups];
-  find_reached(footprints, size, reached);
-  for (int i = 0; i < kGroups; ++i) {
+// Blends a batch into a tile, group of rows by group, so that the pixels stay in registers. What a splat does not
+// reach is skipped: it would add zeros.
+template <bool kSilhouette>
+static inline void blend(Pixels* pixels, const Batch& batch, Groups open) {
+  for (; open != 0; open &= open - 1) {
+    const int row = __builtin_ctz(open), i = row / kRows;
     Pixels rows = pixels[i];
-    if constexpr (kSkipRows) {
-      for (std::uint32_t left = reached[i]; left != 0; left &= left - 1) {
-        const int k = __builtin_ctz(left);
-        blend(rows, raw_alpha(footprints[k], i), batch[k]);
-      }
-    } else {
-      for (std::size_t k = 0; k < size; ++k) blend(rows, raw_alpha(footprints[k], i), batch[k]);
+    for (auto left = Groups(batch.reached[row] | batch.reached[row + kRows - 1]); left != 0; left &= left - 1) {
+      const int k = __builtin_ctz(left);
+      blend<kSilhouette>(rows, raw_alpha(batch.footprints[k], i), batch.values[k]);
     }
     pixels[i] = rows;
   }
@@ -239,16 +250,20 @@ static void forward(const TileList& tile, const Splat* splats, const Camera& cam
   Pixels pixels[kGroups];
   start(pixels, tile, camera);
   const Corner at = corner(tile);
-  Values batch[kBatch];
   Footprint footprints[kBatch];
-  for (std::size_t first = 0; first < tile.count && !opaque(pixels); first += kBatch) {
-    const std::size_t size = tile.count - first < kBatch ? tile.count - first : kBatch;
-    for (std::size_t k = 0; k < size; ++k) {
+  Batch batch;
+  batch.footprints = footprints;
+  for (std::size_t first = 0; first < tile.count; first += kBatch) {
+    const Groups open = open_groups(pixels);
+    if (open == 0) break;
+    batch.size = tile.count - first < kBatch ? tile.count - first : kBatch;
+    for (std::size_t k = 0; k < batch.size; ++k) {
       const Splat& s = splats[tile.splats[first + k]];
-      batch[k] = values_of(s);
+      batch.values[k] = values_of(s);
       footprints[k] = footprint(s, at);
     }
-    blend(pixels, batch, footprints, size);
+    find_reached(batch, open, nullptr);
+    blend<true>(pixels, batch, open);
   }
   for (int i = 0; i < kGroups; ++i) {
     store_rows(images.rgb, tile, camera, kRows * i, pixels[i].r);
@@ -270,15 +285,15 @@ struct Sums {
   Rows by_alpha, by_y, by_y_squared, by_r, by_g, by_b, by_z;
 };
 
-// The backward pass of one splat in a group of rows. With q_k = sum over channels of (gradient of the channel times
-// value of splat k), dL/dalpha_k = T_k q_k - Q / (1 - alpha_k).
-template <bool kMap>
-static inline void blend_back(PixelGradients& at, const Values& s, const Footprint& f, int group, Sums& sums) {
-  const Rows raw = raw_alpha(f, group), dy = spread(f.dy + kRows * group);
+// The backward pass of one splat in a group of rows, dy pixels below it. With q_k = sum over channels of (gradient of
+// the channel times value of splat k), dL/dalpha_k = T_k q_k - Q / (1 - alpha_k).
+template <bool kMap, bool kSilhouette>
+static inline void blend_back(PixelGradients& at, const Values& s, Rows raw, Rows dy, Sums& sums) {
   const Rows alpha = keep(raw >= kMinAlpha, min(raw, kMaxAlpha));
   const IntRows takes = at.T >= kMinTransmittance;
   const Rows w = keep(takes, alpha * at.T), left = 1.0f - alpha;
-  const Rows q = at.r * s.r + at.g * s.g + at.b * s.b + at.depth * s.z + at.silhouette;
+  Rows q = at.r * s.r + at.g * s.g + at.b * s.b + at.depth * s.z;
+  if (kSilhouette) q += at.silhouette;
   at.Q -= w * q;
   const Rows gradient_by_log_alpha = keep(takes & (raw <= kMaxAlpha), alpha * (at.T * q - at.Q / left));
   sums.by_alpha += gradient_by_log_alpha;
@@ -293,20 +308,30 @@ static inline void blend_back(PixelGradients& at, const Values& s, const Footpri
   at.T *= left;
 }
 
-template <bool kMap>
-static inline void blend_back(PixelGradients* rows, const Values& s, const Footprint& f, SplatGradient& gradient) {
-  Sums by{};
-  if constexpr (kSkipRows) {
-    for (unsigned left = bits_of_mask(reached_rows(f)); left != 0; left &= left - 1) {
-      const int i = __builtin_ctz(left);
-      blend_back<kMap>(rows[i], s, f, i, by);
-    }
-  } else {
-    for (int i = 0; i < kGroups; ++i) blend_back<kMap>(rows[i], s, f, i, by);
+// Which rows a tile's groups hold.
+struct RowNumbers {
+  Rows of[kGroups];
+  RowNumbers() {
+    for (int i = 0; i < kGroups; ++i) of[i] = rows_of([&](int row) { return splat(float(kRows * i + row)); });
   }
-  const Lanes by_column = folded(by.by_alpha), by_x = by_column * f.dx;
+};
+
+// The backward pass of one splat in some groups of a tile's rows.
+template <bool kMap, bool kSilhouette>
+static inline void blend_back(PixelGradients* rows, const Splat& s, const Corner& tile, const Footprint& f,
+                              const RowNumbers& numbers, Groups groups, SplatGradient& gradient) {
+  if (groups == 0) return;
+  const Values values = values_of(s);
+  const Uniform above = tile.y - uniform(s.v);
+  Sums by{};
+  for (; groups != 0; groups &= groups - 1) {
+    const int i = __builtin_ctz(groups) / kRows;
+    blend_back<kMap, kSilhouette>(rows[i], values, raw_alpha(f, i), numbers.of[i] + above, by);
+  }
+  const Lanes dx = iota() + (tile.x - uniform(s.u));
+  const Lanes by_column = folded(by.by_alpha), by_x = by_column * dx;
   const Lanes sums[8] = {by_column,       by_x,
-                         folded(by.by_y), by_x * f.dx + folded(by.by_y_squared),
+                         folded(by.by_y), by_x * dx + folded(by.by_y_squared),
                          folded(by.by_r), folded(by.by_g),
                          folded(by.by_b), folded(by.by_z)};  // as in SplatGradient
   float* into = &gradient.log_alpha;
@@ -328,10 +353,14 @@ static inline void backward_tile(const TileList& tile, const Splat* splats, cons
     to.Q = to.r * load(drawn.rgb) + to.g * load(drawn.rgb + plane) + to.b * load(drawn.rgb + 2 * plane) +
            to.depth * load(drawn.depth) + to.silhouette * load(drawn.silhouette);
   }
+  const RowNumbers numbers;
+  Groups open = kAllGroups;
   for (std::size_t k = 0; k < tile.count; ++k) {
-    if (k % 8 == 7 && opaque(rows)) break;
+    if (k % 8 == 7 && (open = open_groups(rows)) == 0) break;
     const Splat& s = splats[tile.splats[k]];
-    blend_back<kMap>(rows, values_of(s), footprint(s, at), gradients[tile.splats[k]]);
+    const Footprint f = footprint(s, at);
+    const Groups reached = groups_of(bits_of_mask(reached_rows(f))) & open;
+    blend_back<kMap, true>(rows, s, at, f, numbers, reached, gradients[tile.splats[k]]);
   }
 }
 
@@ -343,7 +372,7 @@ static void backward(const TileList& tile, const Splat* splats, const Camera& ca
     backward_tile<false>(tile, splats, camera, drawn, gradient, gradients);
 }
 
-static_assert(sizeof(Footprint) == kFloatsPerFootprint * sizeof(float), "scratch is allocated elsewhere");
+static_assert(sizeof(Footprint) + 1 <= kFloatsPerFootprint * sizeof(float), "scratch is allocated elsewhere");
 
 static inline Lanes load_bytes(const std::uint8_t* pixels, int columns, int channel) {
   std::int32_t values[8] = {};
@@ -427,28 +456,36 @@ static inline double start(PixelGradients& rows, const Pixels& drawn, const Tile
 static double fit(const TileList& tile, const Splat* splats, const Camera& camera, const Target& target, float* scratch,
                   SplatGradient* gradients) {
   Footprint* footprints = reinterpret_cast<Footprint*>(scratch);
+  std::uint8_t* groups = reinterpret_cast<std::uint8_t*>(footprints + tile.count);  // in which a splat is seen
   Pixels pixels[kGroups];
   start(pixels, tile, camera);
   const Corner at = corner(tile);
-  Values batch[kBatch];
+  Batch batch;
   std::size_t count = 0;
-  while (count < tile.count && !opaque(pixels)) {
-    const std::size_t size = tile.count - count < kBatch ? tile.count - count : kBatch;
-    for (std::size_t k = 0; k < size; ++k) {
+  while (count < tile.count) {
+    const Groups open = open_groups(pixels);
+    if (open == 0) break;
+    batch.size = tile.count - count < kBatch ? tile.count - count : kBatch;
+    batch.footprints = footprints + count;
+    for (std::size_t k = 0; k < batch.size; ++k) {
       const Splat& s = splats[tile.splats[count + k]];
-      batch[k] = values_of(s);
+      batch.values[k] = values_of(s);
       footprints[count + k] = footprint(s, at);
     }
-    blend(pixels, batch, footprints + count, size);
-    count += size;
+    find_reached(batch, open, groups + count);
+    blend<false>(pixels, batch, open);
+    count += batch.size;
   }
   const Compared to{target, huber(target.color_weight, target.color_limit),
                     huber(target.depth_weight, target.depth_limit)};
   double loss = 0.0;
   PixelGradients rows[kGroups];
   for (int i = 0; i < kGroups; ++i) loss += start(rows[i], pixels[i], tile, camera, kRows * i, to);
-  for (std::size_t k = 0; k < count; ++k)
-    blend_back<true>(rows, values_of(splats[tile.splats[k]]), footprints[k], gradients[tile.splats[k]]);
+  const RowNumbers numbers;
+  for (std::size_t k = 0; k < count; ++k) {
+    const std::uint32_t member = tile.splats[k];
+    blend_back<true, false>(rows, splats[member], at, footprints[k], numbers, groups[k], gradients[member]);
+  }
   return loss;
 }
 

@@ -165,7 +165,6 @@ static inline Lanes row_sums(const Lanes* rows) {
 typedef Lanes Rows;
 typedef IntLanes IntRows;
 constexpr int kRows = 1;
-constexpr bool kSkipRows = true;
 
 template <typename MakeRow>
 static inline Rows rows_of(const MakeRow& row) {

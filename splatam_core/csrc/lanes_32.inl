@@ -81,7 +81,6 @@ static inline Uniform highest(Lanes x) {
 // Two rows of a tile at a time, the upper one first: one register if the processor has registers of that size, else
 // two.
 constexpr int kRows = 2;
-constexpr bool kSkipRows = false;
 #if SPLATAM_PAIRED
 typedef float Rows __attribute__((vector_size(64)));
 typedef std::int32_t IntRows __attribute__((vector_size(64)));

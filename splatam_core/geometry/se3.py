@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,61 +29,67 @@ def skew(v: Vector) -> Matrix:
 
 def exp(twist: Vector) -> Matrix:
     """Returns the motion [4, 4] of a twist [6]: translation (metres), rotation (radians)."""
-    rho, phi = np.asarray(twist[:3], dtype=np.float64), np.asarray(twist[3:], dtype=np.float64)
-    angle = float(np.linalg.norm(phi))
-    S = skew(phi)
+    *rho, x, y, z = (float(value) for value in twist)  # single numbers: arrays as short as this take ten times as long
+    squared = x * x + y * y + z * z
+    angle = math.sqrt(squared)
     if angle < 1e-5:  # series, because the closed forms lose all digits here
-        a, b, c = 1.0 - angle**2 / 6, 0.5 - angle**2 / 24, 1 / 6 - angle**2 / 120
+        a, b, c = 1.0 - squared / 6, 0.5 - squared / 24, 1 / 6 - squared / 120
     else:
-        a = np.sin(angle) / angle
-        b = (1 - np.cos(angle)) / angle**2
-        c = (angle - np.sin(angle)) / angle**3
-    T = np.eye(4)
-    T[:3, :3] = np.eye(3) + a * S + b * S @ S
-    T[:3, 3] = (np.eye(3) + b * S + c * S @ S) @ rho
-    return T
+        a, b, c = math.sin(angle) / angle, (1 - math.cos(angle)) / squared, (angle - math.sin(angle)) / (squared * angle)
+    turned = _cross((x, y, z), rho)
+    twice = _cross((x, y, z), turned)
+    t = [rho[i] + b * turned[i] + c * twice[i] for i in range(3)]
+    return np.array(
+        [
+            [1 + b * (x * x - squared), b * x * y - a * z, b * x * z + a * y, t[0]],
+            [b * x * y + a * z, 1 + b * (y * y - squared), b * y * z - a * x, t[1]],
+            [b * x * z - a * y, b * y * z + a * x, 1 + b * (z * z - squared), t[2]],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
 def log(T: Matrix) -> Vector:
     """Returns the twist [6], translation and rotation, whose ``exp`` is T; the rotation angle is in [0, pi]."""
-    phi = rotation_vector(T[:3, :3])
-    angle = float(np.linalg.norm(phi))
-    S = skew(phi)
+    phi, t = rotation_vector(T[:3, :3]).tolist(), T[:3, 3].tolist()
+    angle = math.hypot(*phi)
     if angle < 1e-5:
         c = 1 / 12 + angle**2 / 720
     else:
         half = angle / 2
-        c = (1 - half / np.tan(half)) / angle**2
-    V_inverse = np.eye(3) - 0.5 * S + c * S @ S
-    return np.concatenate([V_inverse @ T[:3, 3], phi])
+        c = (1 - half / math.tan(half)) / angle**2
+    turned = _cross(phi, t)
+    twice = _cross(phi, turned)
+    return np.array([*(t[i] - 0.5 * turned[i] + c * twice[i] for i in range(3)), *phi])
+
+
+def _cross(a: Sequence[float], b: Sequence[float]) -> list[float]:
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 def rotation_vector(R: Matrix) -> Vector:
     """Returns [3] axis times angle (radians) of a rotation matrix."""
-    q = quaternion_from_rotation(R)
-    sine = float(np.linalg.norm(q[1:]))
-    if sine < 1e-12:
-        return 2.0 * q[1:]
-    return q[1:] * (2.0 * np.arctan2(sine, q[0]) / sine)
+    w, *axis = quaternion_from_rotation(R).tolist()
+    sine = math.hypot(*axis)
+    factor = 2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, w) / sine
+    return np.array([factor * value for value in axis])
 
 
 def quaternion_from_rotation(R: Matrix) -> Vector:
     """Returns [w, x, y, z] with w >= 0 of a rotation matrix (Shepperd 1978: the largest pivot)."""
-    trace = float(np.trace(R))
-    candidates = np.array([trace, R[0, 0], R[1, 1], R[2, 2]])
-    k = int(np.argmax(candidates))
-    q = np.empty(4)
+    r = R.tolist()
+    pivots = [r[0][0] + r[1][1] + r[2][2], r[0][0], r[1][1], r[2][2]]
+    k = pivots.index(max(pivots))
     if k == 0:
-        q[:] = 1 + trace, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+        q = [1 + pivots[0], r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]]
     else:
-        i = k - 1
-        j, m = (i + 1) % 3, (i + 2) % 3
-        q[0] = R[m, j] - R[j, m]
-        q[1 + i] = 1 + R[i, i] - R[j, j] - R[m, m]
-        q[1 + j] = R[j, i] + R[i, j]
-        q[1 + m] = R[m, i] + R[i, m]
-    q /= np.linalg.norm(q)
-    return -q if q[0] < 0 else q
+        i, j, m = k - 1, k % 3, (k + 1) % 3
+        q = [r[m][j] - r[j][m], 0.0, 0.0, 0.0]
+        q[1 + i] = 1 + r[i][i] - r[j][j] - r[m][m]
+        q[1 + j] = r[j][i] + r[i][j]
+        q[1 + m] = r[m][i] + r[i][m]
+    length = math.copysign(math.hypot(*q), q[0])
+    return np.array(q) / length
 
 
 def rotation_from_quaternion(q: Vector) -> Matrix:

@@ -15,7 +15,7 @@ from torch import Tensor
 from splatam_core.config import KeyframeConfig, SlamConfig
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.images.view import unproject
-from splatam_core.mapping.posed import PosedView
+from splatam_core.mapping.posed import PosedFrame, PosedView
 
 _BATCH = 64  # keyframes whose overlap is computed at once; more would not fit a core's cache
 
@@ -75,9 +75,9 @@ class KeyframeStore(Sequence[PosedView]):
         self._remember(keyframe, copy)
         return copy
 
-    def window(self, views: Sequence[PosedView]) -> Window:
-        """Returns views as a window, each of which is copied to the device when it is used."""
-        return Window(views, self)
+    def window(self, views: Sequence[PosedView], current: PosedFrame | None = None) -> Window:
+        """Returns views as a window, each of which is copied to the device when it is used; the current frame is the last."""
+        return Window(views, self, current)
 
     def _remember(self, keyframe: PosedView, copy: PosedView) -> None:
         self._copies[keyframe] = copy
@@ -101,16 +101,20 @@ def least_needed(keyframes: Sequence[PosedView]) -> int:
 
 
 class Window(Sequence[PosedView]):
-    """Views that are mapped together; the current one is the last. Each is copied to the device when it is used."""
+    """Views that are mapped together; the current one is the last. Each is made, and copied to the device, when it is used."""
 
-    def __init__(self, views: Sequence[PosedView], store: KeyframeStore) -> None:
-        self._views, self._store = views, store
+    def __init__(self, views: Sequence[PosedView], store: KeyframeStore, current: PosedFrame | None = None) -> None:
+        self._views, self._store, self._current = views, store, current
 
     def __len__(self) -> int:
-        return len(self._views)
+        return len(self._views) + (self._current is not None)
 
     def __getitem__(self, index: Any) -> Any:
         """Returns one view, on the device."""
+        index = range(len(self))[index]
+        if index == len(self._views):
+            assert self._current is not None
+            return self._store.on_device(self._current.to_fit)
         return self._store.on_device(self._views[index])
 
 

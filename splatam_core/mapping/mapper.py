@@ -101,12 +101,12 @@ class Mapper:
         """Returns the views to fit the map to, the frame last; keeps the frame as a keyframe where the plan says so."""
         if not plan.is_used or len(self.map) == 0:
             return self.keyframes.window([])
-        chosen = []
+        chosen = None
         if plan.steps is not None:
-            chosen = [*select_keyframes(frame.host, self.keyframes, self._config.keyframes, self.rng), frame.to_fit]
+            chosen = select_keyframes(frame.host, self.keyframes, self._config.keyframes, self.rng)
         if plan.is_keyframe:
             self.keyframes.append(frame.keyframe.bare(), frame.to_fit)
-        return self.keyframes.window(chosen)
+        return self.keyframes.window([]) if chosen is None else self.keyframes.window(chosen, frame)
 
     def optimize(self, window: Window, plan: MappingPlan) -> None:
         """Fits the map to the window, one random view a step, and prunes."""

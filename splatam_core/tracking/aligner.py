@@ -59,6 +59,31 @@ class LinearSystem(Protocol):
         """Median absolute residual of depth, relative to the depth; NaN if no point is seen."""
 
 
+class EvidenceSums(Protocol):
+    """What ``tracking.evidence`` judges a pose by: sums over every n-th point of the reference.
+
+    Cells are those of a grid over the image, row by row. The sums of a cell are, in this order: how many points are compared in
+    brightness; how many meet a reading of the frame; of these, how many are near it; the expected brightness of the first, the
+    brightness found, the squares of both, their product, and the absolute difference.
+    """
+
+    @property
+    def claimed(self) -> Matrix:
+        """[9, 9] weighted products of the derivatives that the frame's gradients give."""
+
+    @property
+    def shared(self) -> Matrix:
+        """[9, 9] weighted products of the derivatives that the reference's gradients would give with those."""
+
+    @property
+    def scores(self) -> Matrix:
+        """[9, cells] weighted products of the latter and the residuals."""
+
+    @property
+    def cells(self) -> Matrix:
+        """[9, cells] the sums of the cells."""
+
+
 class Aligner(Protocol[ImageT]):
     """The operations of direct alignment.
 
@@ -117,4 +142,41 @@ class Aligner(Protocol[ImageT]):
             max_depth_ratio: points whose relative depth differs by more are on another surface.
             inlier_color: largest residual of brightness of an inlier.
             inlier_depth: largest residual of depth of an inlier.
+        """
+
+    def evidence(
+        self,
+        brightness: ImageT,
+        depth: ImageT,
+        layers: ImageT,
+        *,
+        camera: PinholeCamera,
+        color_motion: Array,
+        depth_motion: Array,
+        velocity: Array,
+        gain: float,
+        bias: float,
+        photometric_scale: float,
+        depth_scale: float,
+        max_depth_ratio: float,
+        max_depth_error: float,
+        step: int,
+    ) -> EvidenceSums:
+        """Sums what the residuals at the end of an alignment say about the pose.
+
+        Args:
+            brightness: as of ``linearize``, and so are the arguments that follow.
+            depth: see there.
+            layers: see there.
+            camera: see there.
+            color_motion: see there.
+            depth_motion: see there.
+            velocity: see there.
+            gain: see there.
+            bias: see there.
+            photometric_scale: see there.
+            depth_scale: see there.
+            max_depth_ratio: see there.
+            max_depth_error: relative depth by which a point near the map differs at most.
+            step: every n-th pixel of every n-th row is compared.
         """

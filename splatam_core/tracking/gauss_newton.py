@@ -15,7 +15,7 @@ from splatam_core.config import TrackingConfig
 from splatam_core.geometry import se3
 from splatam_core.geometry.se3 import Matrix
 from splatam_core.tracking.aligner import Aligner, Array, LinearSystem
-from splatam_core.tracking.evidence import Evidence, Linearization, weigh
+from splatam_core.tracking.evidence import Evidence, Knowns, max_depth_error, step_of, weigh
 from splatam_core.tracking.pyramid import EDGE, Level
 from splatam_core.tracking.time_offset import TimeOffset
 
@@ -208,26 +208,25 @@ class GaussNewton:
 
     def _weigh(self, pair: _Pair, state: AlignmentState, scales: tuple[float, float]) -> Evidence:
         reference = pair.reference
-        at = Linearization(
+        photometric_scale, depth_scale = self._weighted(pair, scales)
+        sums = self._aligner.evidence(
+            reference.brightness,
+            reference.depth,
+            pair.layers,
             camera=reference.camera,
-            brightness=_on_host(reference.brightness),
-            depth=_on_host(reference.depth),
-            layers=_on_host(pair.layers),
-            color_motion=state.color_motion,
-            depth_motion=state.depth_motion,
-            velocity=state.velocity,
+            color_motion=state.color_motion.astype(np.float32),
+            depth_motion=state.depth_motion.astype(np.float32),
+            velocity=state.velocity.astype(np.float32),
             gain=state.gain,
             bias=state.bias,
-            scales=self._weighted(pair, scales),
-            prior=np.append(_PRIOR, pair.time_offset.information),
-            prior_inflation=pair.time_offset.inflation,
-            free=self._free,
+            photometric_scale=photometric_scale,
+            depth_scale=depth_scale,
+            max_depth_ratio=2 * EDGE,
+            max_depth_error=max_depth_error(depth_scale),
+            step=step_of(reference.camera),
         )
-        return weigh(at, max_depth_ratio=2 * EDGE)
-
-
-def _on_host(image: Array | Tensor) -> Array:
-    return image.numpy(force=True) if isinstance(image, Tensor) else image
+        prior = np.append(_PRIOR, pair.time_offset.information)
+        return weigh(sums, Knowns(reference.camera, state.velocity, prior, pair.time_offset.inflation, self._free))
 
 
 def _is_better(start: LinearSystem, found: LinearSystem) -> bool:

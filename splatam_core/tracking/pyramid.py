@@ -64,12 +64,17 @@ def render_level(render: Render, camera: PinholeCamera, silhouette_threshold: fl
 
     Where Gaussians of two frames meet, the silhouette dips and the black behind them shows. The brightness is that without it.
     """
-    visible = render.silhouette > silhouette_threshold
-    rgb = (render.rgb / render.silhouette.clamp(min=max(silhouette_threshold, _LEAST_SILHOUETTE))).permute(1, 2, 0)
-    if not is_on_host(rgb):
+    least = max(silhouette_threshold, _LEAST_SILHOUETTE)
+    if not is_on_host(render.rgb):
+        visible, rgb = render.silhouette > silhouette_threshold, (render.rgb / render.silhouette.clamp(min=least)).permute(1, 2, 0)
         return Level(camera, luminance(rgb), torch.where(visible, render.depth(), torch.nan))
-    depth = np.where(visible.numpy(), render.depth().numpy(), np.float32(np.nan))
-    return Level(camera, _brightness(np.ascontiguousarray(rgb.numpy())), depth)
+    silhouette, (red, green, blue) = render.silhouette.numpy(), render.rgb.numpy()
+    light = np.float32(0.299) * red
+    light += np.float32(0.587) * green
+    light += np.float32(0.114) * blue
+    light /= np.maximum(silhouette, np.float32(least))
+    depth = np.where(silhouette > silhouette_threshold, render.depth().numpy(), np.float32(np.nan))
+    return Level(camera, light, depth)
 
 
 def half_pyramid(level: Level, aligner: Aligner[Any]) -> list[Level]:

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.se3 import Matrix
-from splatam_core.tracking.aligner import Array
+from splatam_core.tracking.aligner import Array, EvidenceSums
+from splatam_core.tracking.evidence import Linearization, summed
 
 _UNKNOWNS = 9
 _BINS = 1024  # of the histogram of absolute residuals, an eighth of an octave each
@@ -103,6 +104,42 @@ class TorchAligner:
         counts = torch.stack([known, compared, seen, agree]).sum(dim=1)
         system = torch.where(used, jacobian, 0), residuals
         return _summed(system, scales, counts, _medians(residuals, used), seen)
+
+    def evidence(
+        self,
+        brightness: Tensor,
+        depth: Tensor,
+        layers: Tensor,
+        *,
+        camera: PinholeCamera,
+        color_motion: Array,
+        depth_motion: Array,
+        velocity: Array,
+        gain: float,
+        bias: float,
+        photometric_scale: float,
+        depth_scale: float,
+        max_depth_ratio: float,
+        max_depth_error: float,
+        step: int,
+    ) -> EvidenceSums:
+        """See ``Aligner.evidence``. On the host."""
+        at = Linearization(
+            camera=camera,
+            brightness=brightness.numpy(force=True),
+            depth=depth.numpy(force=True),
+            layers=layers.numpy(force=True),
+            color_motion=color_motion.astype(np.float64),
+            depth_motion=depth_motion.astype(np.float64),
+            velocity=velocity.astype(np.float64),
+            gain=gain,
+            bias=bias,
+            scales=(photometric_scale, depth_scale),
+            max_depth_ratio=max_depth_ratio,
+            max_depth_error=max_depth_error,
+            step=step,
+        )
+        return summed(at)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

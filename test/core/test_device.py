@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -124,7 +125,7 @@ def test_keyframes_are_in_the_hosts_memory_and_a_bounded_number_on_the_device() 
 
 
 def test_a_frame_goes_to_the_device_once(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
-    """To be tracked and, smaller, to be fitted: then, as a keyframe, and in a later window. None is read back."""
+    """To be tracked and, smaller, to be fitted, if a step draws it or it is a keyframe. None is read back."""
     sequence, brought = room(6, WIDTH), []
     original = View.to
 
@@ -139,7 +140,8 @@ def test_a_frame_goes_to_the_device_once(room: Room, monkeypatch: pytest.MonkeyP
         for index in range(6):
             slam.process(sequence[index])
         assert len(slam.state().keyframes) == 3
-    assert sorted(view.camera.width for view in brought) == [WIDTH * 3 // 4] * 6 + [WIDTH] * 6
+    widths = Counter(view.camera.width for view in brought)
+    assert widths.pop(WIDTH) == 6 and 3 <= widths.pop(WIDTH * 3 // 4) <= 6 and not widths
 
 
 def test_no_step_of_tracking_waits_for_the_device(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:

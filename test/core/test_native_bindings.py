@@ -72,6 +72,15 @@ def linearize(**changed: object) -> None:
     _native.Aligner(1).linearize(**(arguments | changed))
 
 
+def evidence(**changed: object) -> None:
+    arguments = {
+        'brightness': floats(HEIGHT, WIDTH), 'depth': floats(HEIGHT, WIDTH), 'layers': floats(HEIGHT, WIDTH, 8), 'camera': CAMERA,
+        'color_motion': POSE, 'depth_motion': POSE, 'velocity': floats(6), 'gain': 1.0, 'bias': 0.0, 'photometric_scale': 0.1,
+        'depth_scale': 0.1, 'max_depth_ratio': 0.1, 'max_depth_error': 0.1, 'step': 2,
+    }  # fmt: skip
+    _native.Aligner(1).evidence(**(arguments | changed))
+
+
 def halve(**changed: object) -> None:
     arguments = {'brightness': floats(HEIGHT, WIDTH), 'depth': floats(HEIGHT, WIDTH), 'max_step': 0.1}
     _native.Aligner(1).halve(**(arguments | changed))
@@ -102,6 +111,7 @@ CALLS = {
     | {'pose_gradient': (4, 4), 'images_at_0': IMAGE, 'images_at_1': PLANE, 'image_gradients_at_2': PLANE},
     fit: GAUSSIANS | {'bounds': (1, 7), 'moments': (N, 16), 'target_depth': PLANE},
     linearize: {'brightness': PLANE, 'depth': PLANE, 'layers': (HEIGHT, WIDTH, 8), 'velocity': (6,)},
+    evidence: {'brightness': PLANE, 'depth': PLANE, 'layers': (HEIGHT, WIDTH, 8), 'velocity': (6,)},
     halve: {'brightness': PLANE, 'depth': PLANE},
     blend: {'shapes': (N, 6), 'features': (N, 4), 'image': (5, HEIGHT, WIDTH)},
     blend_back: {

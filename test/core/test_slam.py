@@ -12,12 +12,14 @@ import torch
 
 from splatam_core.config import AlignmentConfig, KeyframeConfig, PaperTrackingConfig, TrackingConfig, load_config
 from splatam_core.datasets.registry import open_sequence
+from splatam_core.device import HOST
 from splatam_core.errors import ConfigError, FrameError, SplatamError
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.images.observation import Observation
 from splatam_core.images.view import View
-from splatam_core.mapping.keyframes import draw
-from splatam_core.mapping.posed import PosedView
+from splatam_core.mapping.keyframes import KeyframeStore, draw
+from splatam_core.mapping.posed import PosedFrame, PosedView
 from splatam_core.rasterizer import Gaussians, Render, make_rasterizer
 from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.slam import Slam
@@ -377,6 +379,17 @@ def test_views_are_fitted_and_kept_at_the_size_of_mapping(
     cameras = [keyframe.view.camera for keyframe in slam.state().keyframes]
     assert cameras == [room[0][0].camera.resized(60, 45)] * 3 and slam.camera == room[0][0].camera
     assert len(fitted) == slam.config.mapping.iterations * (1 + 2 + 3)  # of every second frame, with its keyframes
+
+
+def test_the_current_view_is_shrunk_only_when_it_is_drawn(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    config = load_config('realtime')
+    seen = Observation.from_frame(room[0][0], config.depth, HOST)
+    first, current = (PosedFrame(seen, np.eye(4), config.mapping, index) for index in range(2))
+    window = KeyframeStore(HOST, config.keyframes).window([first.keyframe], current)
+    assert len(window) == 2 and window[0].frame == 0 and 'to_fit' not in vars(current)
+    assert window[1].frame == window[-1].frame == 1 and window[1].view.camera == first.keyframe.view.camera
+    with pytest.raises(IndexError):
+        window[2]
 
 
 @pytest.mark.parametrize('preset', ['quick', 'realtime'])

@@ -21,6 +21,8 @@ from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.rasterizer.native import make_native_aligner
 from splatam_core.slam import Slam
 from splatam_core.tracking import TorchAligner, alignment, make_tracker
+from splatam_core.tracking.aligner import EvidenceSums
+from splatam_core.tracking.evidence import step_of
 from splatam_core.tracking.torch_aligner import TorchLinearSystem
 from splatam_core.tracking.verdict import verify
 
@@ -138,6 +140,25 @@ def test_linear_system_is_the_native_one(
     assert found.depth_median == pytest.approx(expected.depth_median, rel=0.13)
 
 
+@pytest.mark.parametrize('time_offset', [0.0, 0.3])
+@pytest.mark.parametrize('size', [(48, 65), (120, 160), (7, 9)])
+def test_evidence_is_the_native_one(size: tuple[int, int], time_offset: float) -> None:
+    """To the rounding of sums of float32; with any number of threads the same."""
+    (brightness, z), camera, depth_motion = _picture(1, size), _camera(size), se3.exp(TWIST)
+    color_motion = se3.exp(time_offset * VELOCITY.astype(np.float64)) @ depth_motion if time_offset else depth_motion
+    settings = _settings(color_motion, depth_motion, 1.05, 0.01) | {'max_depth_error': 0.03, 'step': step_of(camera)}
+    settings = {name: value for name, value in settings.items() if not name.startswith('inlier')}
+    native, threaded = make_native_aligner(1), make_native_aligner(3)
+    images = brightness, z, native.layers(brightness + np.float32(0.02), 1.002 * z, EDGE)
+    expected = TorchAligner().evidence(*_tensors(*images), camera=camera, **settings)
+    found, again = (aligner.evidence(*images, camera=camera, **settings) for aligner in (native, threaded))
+    assert expected.cells[0].sum() > 0.3 * expected.cells[1].sum() > 0
+    for name in ('claimed', 'shared', 'scores', 'cells'):
+        ours, theirs = getattr(found, name), getattr(expected, name)
+        assert np.abs(ours - theirs).max() < 1e-4 * np.abs(theirs).max(), name
+        assert np.array_equal(ours, getattr(again, name)), name
+
+
 def test_nothing_in_sight_gives_an_empty_system() -> None:
     """No points, or none that fall into the frame: zeros, and medians that are NaN."""
     brightness, depth = _picture(4, (40, 50))
@@ -192,6 +213,9 @@ class _Bridge:
 
     def halve(self, brightness: Image, depth: Image, max_step: float) -> tuple[Image, ...]:
         return tuple(image.numpy() for image in self._aligner.halve(*_tensors(brightness, depth), max_step))
+
+    def evidence(self, brightness: Image, depth: Image, layers: Image, **settings: Any) -> EvidenceSums:
+        return self._aligner.evidence(*_tensors(brightness, depth, layers), **settings)
 
     def linearize(self, brightness: Image, depth: Image, layers: Image, **settings: Any) -> TorchLinearSystem:
         return self._aligner.linearize(*_tensors(brightness, depth, layers), **settings)
