@@ -37,7 +37,7 @@ from splatam_core.runs.record import read_run
 PACKAGES = ('@sparkjsdev/spark@2.2.0', 'three@0.180.0')
 FILES = ('map.ply', 'map_sh3.ply', 'map.splat')
 NEAR_M, FAR_M = 0.05, 100.0
-DRAWN_FRAMES = 40  # the viewer sorts in the background
+DRAWN_FRAMES = 12  # the viewer sorts in the background
 
 PAGE = """<!DOCTYPE html>
 <meta charset="utf-8"><style>body { margin: 0; background: #000; } canvas { display: block; }</style>

@@ -52,6 +52,7 @@ INPUTS = (
     Topic('initialpose', 'geometry_msgs/msg/PoseWithCovarianceStamped',
           "where the robot is in `map_frame`, told by a person (RViz's 2D Pose Estimate); without a base, where the camera is and "
           'looks to'),
+    Topic('imu', 'sensor_msgs/msg/Imu', 'gravity while the camera rests, with `grid.imu`'),
     Topic('/tf_static', 'tf2_msgs/msg/TFMessage', 'pose of the camera in the base; which frames already have a parent'),
     Topic('/tf', 'tf2_msgs/msg/TFMessage', 'odometry from which tracking starts, with `odom.source: tf`'),
 )  # fmt: skip

@@ -84,7 +84,7 @@ def recording() -> Callable[[str], Path]:
 
 @pytest.fixture(scope='session')
 def browser() -> str:
-    """Path of Chromium. If it is absent, or Playwright that drives it, the test is skipped; with SPLATAM_REQUIRE_BROWSER=1 it fails."""
+    """Path of Chromium. Without it, or without Playwright, the test is skipped; with SPLATAM_REQUIRE_BROWSER=1 it fails."""
     program = find_browser()
     if program is not None and find_spec('playwright') is not None:
         return program

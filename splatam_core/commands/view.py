@@ -23,6 +23,7 @@ ONLINE_COLOR, FINAL_COLOR = (240, 180, 40), (90, 200, 250)
 PICTURE_SIZE = (1280, 720)
 IMAGE_WIDTH = 240
 STEP_S = 0.04
+SAME_M = 1e-3
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -112,7 +113,8 @@ class ShownRun:
             raise ViewerError(f'{run.path}: no frame has a pose')
         self._run, self._gaussians = run, gaussians
         self._rows = pack(_snapshot(gaussians))
-        self._final = np.zeros((0, 3)) if run.final is None else run.final.T_world_cam[:, :3, 3]
+        self._final = _corrected_path(run)
+        self._in_map = run.poses()
         self._stamps_ns = run.stamps_ns()
         counts = np.array([frame.num_gaussians for frame in run.frames] or [len(gaussians)] * len(self._stamps_ns))
         counts = np.maximum.accumulate(counts) / max(1, counts.max())
@@ -149,11 +151,11 @@ class ShownRun:
         past = path.T_world_cam[path.stamps_ns <= stamp_ns]
         scene.show_line('trajectory', past[:, :3, 3], ONLINE_COLOR)
         scene.show_line('trajectory_final', self._final, FINAL_COLOR)
-        if len(past) and self._run.camera is not None:
-            has_pose = path.stamps_ns[len(past) - 1] == stamp_ns
-            scene.show_camera(past[-1], self._run.camera, self._images.at(frame, past[-1]) if has_pose else None)
+        pose = self._in_map.get(stamp_ns)  # the map is the final one
+        if pose is not None and self._run.camera is not None:
+            scene.show_camera(pose, self._run.camera, self._images.at(frame, pose))
             if panel.follows:
-                scene.follow(past[-1])
+                scene.follow(pose)
         status = self._run.frames[frame].status.value if frame < len(self._run.frames) else ''
         panel.say(
             f'**{self._run.path.name}**, frame {frame + 1} of {len(self._stamps_ns)} {status}  \n'
@@ -161,6 +163,15 @@ class ShownRun:
             f"camera's image: {self._images.origin}"
         )
         self._shown = frame
+
+
+def _corrected_path(run: RunRecord) -> NDArray[np.float64]:
+    """Returns [N, 3] where the camera was in the final map; [0, 3] where that is where it was tracked: one line is enough then."""
+    import numpy as np
+
+    positions = run.in_final_map().T_world_cam[:, :3, 3]
+    moved_m = np.linalg.norm(positions - run.trajectory.T_world_cam[:, :3, 3], axis=1)
+    return positions if moved_m.max() > SAME_M else positions[:0]
 
 
 class _Images:

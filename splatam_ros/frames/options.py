@@ -19,6 +19,7 @@ class FrameOptions:
         publish_tf: True to publish transforms.
         odom_source: where odometry comes from, ``none``, ``topic`` or ``tf``.
         odom_max_wait_s: longest wait for odometry that is newer than the frame.
+        uses_imu: True to take up from an Imu at rest.
     """
 
     map_frame: str
@@ -30,6 +31,7 @@ class FrameOptions:
     publish_tf: bool
     odom_source: str
     odom_max_wait_s: float
+    uses_imu: bool = False
 
     @property
     def has_odometry(self) -> bool:
@@ -43,8 +45,8 @@ class FrameOptions:
 
     @property
     def subscribes_tf_static(self) -> bool:
-        """True if the node needs ``/tf_static``: to look up the camera, or to find out which frames have a parent."""
-        return self.publish_tf or self.looks_up_camera or self.has_odometry
+        """True if the node needs ``/tf_static``: to look up the camera or the Imu, or to find out which frames have a parent."""
+        return self.publish_tf or self.looks_up_camera or self.has_odometry or self.uses_imu
 
     @property
     def subscribes_tf(self) -> bool:

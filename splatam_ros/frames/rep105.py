@@ -43,6 +43,7 @@ class Located:
         T_map_body: [4, 4] pose of the body in the map.
         T_map_odom: [4, 4] correction of the odometry; None if the odometry is not known at this stamp.
         T_map_steady: [4, 4] all corrections of the map by loops: poses times its inverse never jump.
+        up_world: [3] upward direction in the core's world, by an Imu at rest; None if it is not known.
     """
 
     stamp_ns: int
@@ -53,6 +54,7 @@ class Located:
     T_map_body: Matrix
     T_map_odom: Matrix | None
     T_map_steady: Matrix = field(default_factory=lambda: np.eye(4))
+    up_world: Matrix | None = None
 
     @property
     def T_steady_body(self) -> Matrix:

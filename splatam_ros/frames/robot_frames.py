@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
 from splatam_core.types import RgbdFrame
 from splatam_ros.frames.buffer import TransformBuffer
+from splatam_ros.frames.gravity import GravitySubscription
 from splatam_ros.frames.odometry_prior import OdometryPrior, OdometrySubscription
 from splatam_ros.frames.options import FrameOptions
 from splatam_ros.frames.rep105 import CoordinateFrames, Link, Located
@@ -44,6 +47,7 @@ class RobotFrames:
             ConfigError: the options contradict each other.
         """
         buffer = TransformBuffer()
+        self._up_world: Matrix | None = None
         self.begin_map()
         self._frames = CoordinateFrames(options, buffer, warnings)
         self._tf = TfTopics(node, options, buffer, warnings)
@@ -54,6 +58,7 @@ class RobotFrames:
             self.odometry = OdometrySubscription(
                 node, options.odom_frame, buffer, warnings, reliability=reliability, keep_all=keep_all
             )
+        self._gravity = GravitySubscription(node, buffer, warnings) if options.uses_imu else None
         self.prior: OdometryPrior | None = None
         if options.has_odometry:
             self.prior = OdometryPrior(self._frames, options.odom_max_wait_s, warnings)
@@ -71,15 +76,21 @@ class RobotFrames:
         self, frame: RgbdFrame, T_world_cam: Matrix, T_map_world: Matrix | None, T_world_odom: Matrix | None = None
     ) -> Located | None:
         """Express a tracked camera in the coordinate frames of ROS; see ``CoordinateFrames.locate``."""
-        return self._frames.locate(frame.stamp_ns, frame.frame_id, T_world_cam, T_map_world, T_world_odom)
+        located = self._frames.locate(frame.stamp_ns, frame.frame_id, T_world_cam, T_map_world, T_world_odom)
+        if located is None or self._gravity is None:
+            return located
+        if self._up_world is None and (up := self._gravity.up_in(located.camera_frame, frame.stamp_ns)) is not None:
+            self._up_world = T_world_cam[:3, :3] @ up
+        return replace(located, up_world=self._up_world)
 
     def told(self, frame: RgbdFrame, T_map_body: Matrix, T_map_world: Matrix | None) -> Matrix:
         """Returns where in the core's world a person says that the camera of a frame is; see ``CoordinateFrames.told``."""
         return self._frames.told(frame.stamp_ns, frame.frame_id, T_map_body, T_map_world)
 
     def begin_map(self) -> None:
-        """Forget where the odometry is in the map: a new one begins."""
+        """Forget where the odometry is in the map, and which way is up: a new map begins."""
         self._held: dict[Link, Matrix] = {}
+        self._up_world = None
 
     def publish(self, located: Located) -> None:
         """Publish the transforms of a tracked camera."""

@@ -13,7 +13,7 @@ from msg_adapters.grids import grid_message
 from splatam_core.errors import ExportError
 from splatam_core.geometry import se3
 from splatam_core.mapping.posed import PosedView
-from splatam_core.maps.grid import DepthView, find_floor, upright
+from splatam_core.maps.grid import DepthView, find_floor, points_of, upright
 from splatam_core.maps.keyframe_grid import KeyframeGrid
 from splatam_core.slam import Slam
 from splatam_ros.frames.rep105 import Located
@@ -29,10 +29,14 @@ FIRST_LOOK, MAX_LOOK = 3, 30
 """Number of keyframes from which the floor is looked for at first, and at most."""
 
 
+LOWEST_PERCENT = 1.0  # of the points that are seen; lower ones are errors of depth
+
+
 class FloorPlan:
     """Makes ``~/map/grid`` of the keyframes.
 
-    Up is the base's z axis if ``base_frame`` is set; else the normal of the floor, once it was seen.
+    Up is the base's z axis if ``base_frame`` is set; else against gravity, with ``grid.imu``; else the normal of the floor,
+    once it was seen.
     """
 
     def __init__(self, warnings: ThrottledWarnings) -> None:
@@ -91,6 +95,10 @@ class FloorPlan:
             if options.base_frame:
                 T_world_base = T_world_map @ located.T_map_body
                 up, on_floor = T_world_base[:3, 2], T_world_base[:3, 3]
+            elif options.grid_imu:
+                if located.up_world is None:
+                    raise ExportError('it is not known which way is up: the Imu on the topic imu has not rested yet')
+                up, on_floor = located.up_world, _lowest(keyframes, located.up_world, options)
             elif len(keyframes) >= self._next_look:
                 self._next_look = 2 * len(keyframes)
                 up, on_floor = _floor(keyframes, options)
@@ -107,12 +115,31 @@ def _floor(keyframes: Sequence[PosedView], options: NodeOptions) -> tuple[Matrix
         ExportError: they see none.
     """
     chosen = keyframes[:: -(-len(keyframes) // MAX_LOOK)]
-    views = [DepthView(k.view.depth.numpy(), se3.inverse(k.T_cam_world.numpy().astype(np.float64))) for k in chosen]
+    views = [_depth_view(keyframe) for keyframe in chosen]
     try:
         T_world_floor = se3.inverse(find_floor(views, chosen[0].view.camera, options.grid_range))
     except ExportError as error:
         raise ExportError(f'{error}; set base_frame, whose z axis is taken to point up') from None
     return T_world_floor[:3, 2], T_world_floor[:3, 3]
+
+
+def _lowest(keyframes: Sequence[PosedView], up: Matrix, options: NodeOptions) -> Matrix:
+    """Returns a point [3] of the world at the height of the lowest surface that keyframes see: the floor, if they see it.
+
+    Raises:
+        ExportError: they see nothing in range.
+    """
+    points = np.concatenate([
+        points_of(_depth_view(keyframe), keyframe.view.camera, options.grid_range, stride=4)
+        for keyframe in keyframes[:: max(1, -(-len(keyframes) // MAX_LOOK))]
+    ] or [np.zeros((0, 3))])  # fmt: skip
+    if not len(points):
+        raise ExportError('there is no grid: nothing is within range')
+    return float(np.percentile(points @ up, LOWEST_PERCENT)) * up
+
+
+def _depth_view(keyframe: PosedView) -> DepthView:
+    return DepthView(keyframe.view.depth.numpy(), se3.inverse(keyframe.T_cam_world.numpy().astype(np.float64)))
 
 
 def along_map(up: Matrix, on_floor: Matrix, T_world_map: Matrix) -> Matrix:

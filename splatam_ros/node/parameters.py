@@ -137,6 +137,8 @@ NODE_SETTINGS: tuple[Setting, ...] = (
     _setting('grid.max_height', 1.0, 'Highest such height: that of the robot. Increase for a taller robot.', 'm', -10.0, 100.0),
     _setting('grid.range', 4.0, 'Depth beyond this adds nothing to the grid. Increase when depth is precise far away.', 'm', 0.5,
              100.0),
+    _setting('grid.imu', False, 'Without base_frame: take up from the topic imu while it rests, instead of from the floor that the '
+             'camera sees. How the Imu is fixed to the camera must be on /tf_static.'),
     _setting('viewer.port', 0, 'Port of a web page that shows the map while it grows, the next free one if it is taken; 0 = off. '
              "Set it to watch. Needs pip install 'splatam_ros[viewer]'.", '', 0, 65535),
     _setting('viewer.host', '127.0.0.1', 'Address that the page listens on. 127.0.0.1 is for this machine only; 0.0.0.0 shows the '
@@ -200,6 +202,7 @@ class NodeOptions:
     grid_min_height: float
     grid_max_height: float
     grid_range: float
+    grid_imu: bool
     viewer_port: int
     viewer_host: str
     no_data_timeout: float
@@ -237,6 +240,7 @@ class NodeOptions:
             publish_tf=self.publish_tf,
             odom_source=self.odom_source,
             odom_max_wait_s=self.odom_max_wait,
+            uses_imu=self.grid_imu,
         )
 
 

@@ -47,7 +47,7 @@ def open_server(host: str, port: int) -> Any:
     rich.reconfigure(quiet=True)  # viser prints a banner through it
     logging.getLogger('websockets').setLevel(logging.CRITICAL)  # browsers open connections that they do not use
     try:
-        server = viser.ViserServer(host=host, port=port, label='SplaTAM', verbose=False)
+        server: Any = viser.ViserServer(host=host, port=port, label='SplaTAM', verbose=False)
     except (OSError, AssertionError) as error:
         raise ViewerError(f'the viewer cannot use {host}:{port}: {error}') from None
     server.request_share_url = _refuse_to_share
