@@ -34,8 +34,8 @@ from splatam_core.stopwatch import Stopwatch
 from splatam_core.tracking import Tracker, TrackingResult, make_tracker
 from splatam_core.tracking.alignment import make_aligner
 from splatam_core.tracking.evidence import Evidence
-from splatam_core.tracking.motion import MotionModel, MotionPrior
-from splatam_core.tracking.verdict import Judge, Verdict
+from splatam_core.tracking.motion import MotionModel, MotionPrior, Prediction
+from splatam_core.tracking.verdict import Judge, Verdict, is_weak
 from splatam_core.types import FrameResult, MapSnapshot, RenderedView, RgbdFrame, Status
 
 Matrix = NDArray[np.float64]
@@ -126,6 +126,7 @@ class SlamLifecycle:
         self._judge = Judge()
         self._relocaliser = Relocaliser(Places())
         self.graph = self._new_graph()
+        self._last_seen: Observation | None = None
         self.camera: PinholeCamera | None = None
         self._num_frames = 0
         self._last_stamp_ns: int | None = None
@@ -225,6 +226,7 @@ class SlamLifecycle:
             scene_radius=self._mapper.scene_radius,
             num_frames=self._num_frames,
             last_stamp_ns=self._last_stamp_ns,
+            last_view=None if self._last_seen is None else replace(self._last_seen.host),
         )
 
     def restore(self, state: SlamState) -> None:
@@ -244,13 +246,15 @@ class SlamLifecycle:
                 self.places.restore(state.places)
             self.places.follow(self._mapper.keyframes)
         self.camera = state.camera
+        last = state.last_view
+        self._last_seen = None if last is None else Observation(last, last.to(self.backend.device))
         self._num_frames, self._last_stamp_ns = state.num_frames, state.last_stamp_ns
 
     def rest(self) -> None:
         """Assumes that the camera is at its last pose, at rest; the next frame may have any stamp."""
         self._motion.place(self._motion.last_pose)
         self._relocaliser.interrupt()
-        self._last_stamp_ns = None
+        self._last_stamp_ns = self._last_seen = None
         self.graph.rest()
 
     def render(self, T_world_cam: Matrix) -> RenderedView:
@@ -350,6 +354,15 @@ class SlamLifecycle:
             if self.keyframes and self.keyframes[-1].frame == index:
                 self.places.add(index, seen.host, self._motion.last_pose)
             self.places.follow(self._mapper.keyframes)
+
+    def _with_motion_seen(self, predictions: list[Prediction], found: TrackingResult, view: View) -> list[Prediction]:
+        """Returns the predictions, with the motion that the last two frames show where the map says too little about a pose."""
+        last, (first, *others) = self._last_seen, predictions
+        if last is None or not is_weak(found, self.config.tracking):
+            return predictions
+        T_now_before = first.T_cam_world @ first.T_world_cam_before
+        seen = self._tracker.motion(view, last.device.scaled(self.config.tracking.scale), T_now_before)
+        return [replace(first, seen=seen), *others]
 
     def _new_mapper(self) -> Mapper:
         return Mapper(self.config, self._rasterizer, self.backend.device, self._recording_length, self._stop)

@@ -67,6 +67,7 @@ class Slam(SlamLifecycle):
         # Depth sets the pace: colour that comes late, or twice, says little about how the camera moves.
         T_world_cam_depth, T_world_cam = se3.inverse(tracked.T_cam_world_depth), se3.inverse(tracked.T_cam_world)
         self._motion.observe(frame.stamp_ns, T_world_cam_depth, is_trusted=verdict.status.is_trusted)
+        self._last_seen = seen
         if not verdict.status.is_trusted:
             return current.result(verdict, T_world_cam, self, tracking=tracked)
         self._motion.time_offset = tracked.time_offset
@@ -98,7 +99,7 @@ class Slam(SlamLifecycle):
             )
             for predicted in predictions
         ]
-        return self._judge.choose(found, predictions, self.config.tracking)
+        return self._judge.choose(found, self._with_motion_seen(predictions, found[0], view), self.config.tracking)
 
     def _initialize(self, current: CurrentFrame, seen: Observation) -> FrameResult:
         """Starts the map at the identity pose."""
@@ -123,6 +124,7 @@ class Slam(SlamLifecycle):
         if reason:
             return current.result(Verdict(Status.LOST, f'the map cannot start: {reason}'), None, self)
         self._motion.observe(current.frame.stamp_ns, np.eye(4))
+        self._last_seen = seen
         self._note_place(seen, current.index)
         self._follow_graph(current, np.eye(4))
         return current.result(self._judge.start(), np.eye(4), self, is_keyframe=True)

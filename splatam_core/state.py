@@ -9,6 +9,7 @@ from splatam_core.config import SlamConfig
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.graph.places import Places
 from splatam_core.graph.relocalisation import RelocaliserState
+from splatam_core.images.view import View
 from splatam_core.mapping.posed import PosedView
 from splatam_core.tracking.motion import MotionState
 from splatam_core.tracking.verdict import JudgeState
@@ -33,6 +34,7 @@ class SlamState:
         scene_radius: metres; 0 before the first frame.
         num_frames: number of frames processed.
         last_stamp_ns: stamp of the last frame; None where the next frame may have any stamp.
+        last_view: what the camera saw at the last pose, in the host's memory; None where there is no such frame.
     """
 
     config: SlamConfig
@@ -48,6 +50,7 @@ class SlamState:
     relocaliser: RelocaliserState = field(default_factory=RelocaliserState)
     places: Arrays = field(default_factory=dict)
     graph: Arrays = field(default_factory=dict)
+    last_view: View | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -61,7 +61,8 @@ def test_every_class_that_tracks_is_in_the_table() -> None:
 def test_every_tracker_is_made_and_called_alike() -> None:
     for method in tracking._TRACKERS:
         tracker = tracking.make_tracker(make_rasterizer('cpu', 1), TrackingConfig(method=method), threads=1)
-        assert inspect.signature(type(tracker).track) == inspect.signature(tracking.Tracker.track)
+        for name in ('track', 'motion'):
+            assert inspect.signature(getattr(type(tracker), name)) == inspect.signature(getattr(tracking.Tracker, name)), name
 
 
 # --- a rasterizer ---

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from splatam_core.atomic_io import is_unfinished
 from splatam_core.config import SlamConfig, flat_values, with_values
@@ -40,7 +41,7 @@ from splatam_core.types import Arrays
 
 VERSION = 1
 KIND, KEYFRAME = 'checkpoint', 'keyframe'
-_MAP, _PLACES, _GRAPH = 'map.', 'places.', 'graph.'
+_MAP, _PLACES, _GRAPH, _LAST = 'map.', 'places.', 'graph.', 'last.'
 _KEYFRAME_POSES = 'keyframe_poses'
 _JUDGE = tuple(entry.name for entry in fields(JudgeState) if entry.name != 'covariance')
 _RELOCALISER = {'told': (4, 4), 'recognised_T_world_cam': (4, 4), 'recognised_covariance': (6, 6)}
@@ -112,10 +113,7 @@ class Checkpoints:
     def _write_keyframe(self, keyframe: PosedView) -> str:
         if keyframe.view in self._written:  # its pose may have moved: the checkpoint has that
             return self._written[keyframe.view]
-        arrays = {
-            'rgb8': keyframe.view.rgb8.numpy(force=True), 'depth': keyframe.view.depth.numpy(force=True),
-            'T_cam_world': keyframe.T_cam_world.numpy(force=True),
-        }  # fmt: skip
+        arrays = {**_images(keyframe.view), 'T_cam_world': keyframe.T_cam_world.numpy(force=True)}
         file = pack(KEYFRAME, VERSION, Content({'frame': keyframe.frame, 'spacing': keyframe.view.spacing}, arrays))
         file.write(_keyframe_path(self._folder, file.digest))
         return file.digest
@@ -198,6 +196,9 @@ def _to_content(state: SlamState, progress: Progress, digests: Sequence[str]) ->
     arrays |= {_GRAPH + name: array for name, array in state.graph.items()}
     poses = [keyframe.T_cam_world.numpy(force=True) for keyframe in state.keyframes]
     arrays[_KEYFRAME_POSES] = np.array(poses, np.float32).reshape(-1, 4, 4)
+    if state.last_view is not None:
+        values['last_spacing'] = state.last_view.spacing
+        arrays |= {_LAST + name: image for name, image in _images(state.last_view).items()}
     return Content({**values, **relocaliser.values}, {**arrays, **relocaliser.arrays})
 
 
@@ -236,10 +237,17 @@ def _relocaliser_state(content: Content) -> RelocaliserState:
     return RelocaliserState(values['num_in_doubt'], values['is_anywhere'], arrays.get('told'), recognised)
 
 
+def _images(view: View) -> dict[str, NDArray[Any]]:
+    return {'rgb8': view.rgb8.numpy(force=True), 'depth': view.depth.numpy(force=True)}
+
+
 def _from_content(path: Path, content: Content) -> Checkpoint:
     values, arrays = content.values, content.arrays
     _check_values(values, arrays)
     camera = None if values['camera'] is None else PinholeCamera(**values['camera'])
+    last = None
+    if camera is not None and 'last_spacing' in values:  # not before 0.3
+        last = _view(path, 'last view', {name: arrays[_LAST + name] for name in ('rgb8', 'depth')}, camera, values['last_spacing'])
     stamp_ns, interval_ns = values['motion_ns']
     state = SlamState(
         config=with_values(SlamConfig(), migrated(values['config'])),
@@ -263,6 +271,7 @@ def _from_content(path: Path, content: Content) -> Checkpoint:
         judge=JudgeState() if 'judge' not in values else JudgeState(**values['judge'], covariance=arrays['pose_covariance']),
         relocaliser=_relocaliser_state(content),
         places={name.removeprefix(_PLACES): array for name, array in arrays.items() if name.startswith(_PLACES)},
+        last_view=last,
     )
     return Checkpoint(path, state, Progress(**values['progress']))
 
@@ -302,25 +311,36 @@ def _read_keyframe(folder: Path, digest: str, camera: PinholeCamera | None) -> P
     if camera is None:
         raise CheckpointError(f'{path}: is no keyframe of this run, which has no camera')
     content = read_archive(path, KEYFRAME, VERSION, digest)
-    arrays, spacing = content.arrays, content.values.get('spacing', 1.0)  # dense before 0.3
-    frame = content.values.get('frame', -1)  # 0.1.0 did not record it
-    rgb8, depth, T_cam_world = (arrays[name] for name in ('rgb8', 'depth', 'T_cam_world'))
-    if depth.ndim == 2 and depth.shape != (camera.height, camera.width):  # kept at another size (mapping.scale)
+    arrays, frame = content.arrays, content.values.get('frame', -1)  # 0.1.0 did not record it
+    view = _view(path, 'keyframe', arrays, camera, content.values.get('spacing', 1.0))  # dense before 0.3
+    T_cam_world = arrays['T_cam_world']
+    if (T_cam_world.dtype, T_cam_world.shape) != (np.float32, (4, 4)) or not np.isfinite(T_cam_world).all():
+        raise CheckpointError(f'{path}: is no keyframe of this run: its pose is not finite, or no pose')
+    if type(frame) is not int:
+        raise CheckpointError(f'{path}: is no keyframe of this run: its frame is {frame!r}')
+    return PosedView(view, torch.from_numpy(T_cam_world), frame)
+
+
+def _view(path: Path, what: str, arrays: Arrays, camera: PinholeCamera, spacing: object) -> View:
+    """Returns the images in an archive, of the camera of the run or kept at another size (``mapping.scale``).
+
+    Raises:
+        CheckpointError: they are no such images.
+    """
+    refused, (rgb8, depth) = f'{path}: is no {what} of this run', (arrays[name] for name in ('rgb8', 'depth'))
+    if depth.ndim == 2 and depth.shape != (camera.height, camera.width):
         height, width = depth.shape
         camera = camera.resized(width, height)
     size = (camera.height, camera.width)
-    expected = [('uint8', (*size, 3)), ('float32', size), ('float32', (4, 4))]
-    found = [(array.dtype.name, array.shape) for array in (rgb8, depth, T_cam_world)]
+    expected = [('uint8', (*size, 3)), ('float32', size)]
+    found = [(array.dtype.name, array.shape) for array in (rgb8, depth)]
     if found != expected:
-        raise CheckpointError(f'{path}: is no keyframe of this run: it holds {found}, expected {expected}')
-    if not (np.isfinite(depth).all() and np.isfinite(T_cam_world).all()):
-        raise CheckpointError(f'{path}: is no keyframe of this run: its depth or pose is not finite')
+        raise CheckpointError(f'{refused}: it holds {found}, expected {expected}')
+    if not np.isfinite(depth).all():
+        raise CheckpointError(f'{refused}: its depth is not finite')
     if type(spacing) is not float or not 1 <= spacing < math.inf:
-        raise CheckpointError(f'{path}: is no keyframe of this run: spacing = {spacing!r}, expected at least 1')
-    if type(frame) is not int:
-        raise CheckpointError(f'{path}: is no keyframe of this run: its frame is {frame!r}')
-    view = View(camera, torch.from_numpy(rgb8), torch.from_numpy(depth), spacing)
-    return PosedView(view, torch.from_numpy(T_cam_world), frame)
+        raise CheckpointError(f'{refused}: spacing = {spacing!r}, expected at least 1')
+    return View(camera, torch.from_numpy(rgb8), torch.from_numpy(depth), spacing)
 
 
 def _placed(keyframes: Sequence[PosedView], arrays: Arrays) -> tuple[PosedView, ...]:

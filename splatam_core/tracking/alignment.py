@@ -12,9 +12,10 @@ colour and depth. Few cameras take both at once, and a moving camera sees them f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 
 from splatam_core.config import TrackingConfig
@@ -30,10 +31,13 @@ from splatam_core.tracking.aligner import Aligner
 from splatam_core.tracking.base import TrackingResult
 from splatam_core.tracking.features import pose_by_features
 from splatam_core.tracking.gauss_newton import GaussNewton
+from splatam_core.tracking.motion import SeenMotion
 from splatam_core.tracking.pyramid import Level, frame_level, full_pyramid, half_pyramid, render_level
 from splatam_core.tracking.time_offset import TimeOffset
 from splatam_core.tracking.torch_aligner import TorchAligner
 from splatam_core.tracking.verdict import verify
+
+_LEAST_ERROR_PX = 0.1  # of the motion between two images, along and about each axis: interpolation is no better
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +69,8 @@ class AlignmentTracker:
         self._config = config
         self._aligner = make_aligner(threads, device)
         self._gauss_newton = GaussNewton(self._aligner, config)
+        # Colour is as late in one frame as in the next, so that both images move alike.
+        self._between_frames = GaussNewton(self._aligner, replace(config, align=replace(config.align, time_offset=False)))
 
     def track(
         self,
@@ -82,6 +88,19 @@ class AlignmentTracker:
             return found
         start = self._pose_by_features(frame, T_cam_world if T_cam_world_before is None else T_cam_world_before)
         return found if start is None else self._better(found, self._align_twice(frame, start))
+
+    def motion(self, view: View, before: View, T_now_before: Matrix) -> SeenMotion | None:
+        """See ``Tracker.motion``."""
+        if torch.equal(view.rgb8, before.rgb8):
+            return None  # the same picture sent twice is no sign of rest
+        references, frames = (half_pyramid(frame_level(image, self._aligner), self._aligner) for image in (before, view))
+        found = self._between_frames.align(references, frames, None, TimeOffset(), T_now_before)
+        evidence = found.evidence
+        if evidence.explained < self._config.min_explained_fraction:
+            return None
+        off_rad = _LEAST_ERROR_PX * evidence.pixel_rad
+        off_m = off_rad * float(before.depth[before.valid].median())
+        return SeenMotion(found.state.depth_motion, evidence.covariance + np.diag(np.repeat([off_m, off_rad], 3) ** 2))
 
     def _align_twice(self, frame: _Frame, T_cam_world: Matrix) -> TrackingResult:
         """Aligns from a pose, and where the result is poor once more, from a render at the pose found."""

@@ -9,6 +9,7 @@ from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians
 from splatam_core.tracking.evidence import Evidence
+from splatam_core.tracking.motion import SeenMotion
 from splatam_core.tracking.time_offset import TimeOffset
 
 
@@ -54,4 +55,16 @@ class Tracker(Protocol):
             T_cam_world: [4, 4] predicted pose.
             T_cam_world_before: [4, 4] pose one frame ago; None if not known.
             time_offset: between colour and depth, as the frames before tell; None if they tell nothing.
+        """
+
+    def motion(self, view: View, before: View, T_now_before: Matrix) -> SeenMotion | None:
+        """Finds how the camera has moved between two frames, without the map; changes nothing.
+
+        Args:
+            view: what the camera sees.
+            before: what it saw.
+            T_now_before: [4, 4] the camera then in the camera now, as predicted.
+
+        Returns:
+            The motion; None if the images do not fit each other.
         """

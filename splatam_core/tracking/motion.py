@@ -20,6 +20,19 @@ MAX_EXTRAPOLATION = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SeenMotion:
+    """How the camera has moved from one frame to another, as their images tell without the map.
+
+    Attributes:
+        T_now_before: [4, 4] the camera then in the camera now.
+        covariance: [6, 6] of the twist by which ``exp(twist) @ T_now_before`` is true, m and rad.
+    """
+
+    T_now_before: Matrix
+    covariance: Matrix
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
     """Where the camera is expected.
 
@@ -29,6 +42,7 @@ class Prediction:
         seconds: since then; infinite where that is not known.
         is_guess: True if nothing is known about the motion since then.
         is_measured: True if another sensor has measured it.
+        seen: what the images of the two frames tell about it; None where they were not compared.
     """
 
     T_world_cam: Matrix
@@ -36,6 +50,7 @@ class Prediction:
     seconds: float
     is_guess: bool = False
     is_measured: bool = False
+    seen: SeenMotion | None = None
 
     @property
     def T_cam_world(self) -> Matrix:

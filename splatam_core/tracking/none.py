@@ -10,6 +10,7 @@ from splatam_core.images.view import View
 from splatam_core.interruption import Stop, never
 from splatam_core.rasterizer import Gaussians, Rasterizer
 from splatam_core.tracking.base import TrackingResult
+from splatam_core.tracking.motion import SeenMotion
 from splatam_core.tracking.time_offset import TimeOffset
 
 
@@ -34,3 +35,7 @@ class NullTracker:
     ) -> TrackingResult:
         """See ``Tracker.track``."""
         return TrackingResult(T_cam_world, T_cam_world, num_readings=None, visible_fraction=1.0, inlier_fraction=1.0)
+
+    def motion(self, view: View, before: View, T_now_before: Matrix) -> SeenMotion | None:
+        """See ``Tracker.motion``: it is not asked for, because no pose has evidence."""
+        return None

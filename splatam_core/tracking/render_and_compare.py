@@ -17,6 +17,7 @@ from splatam_core.rasterizer import Gaussians, Rasterizer
 from splatam_core.tracking.base import TrackingResult
 from splatam_core.tracking.candidate import Candidate
 from splatam_core.tracking.loss import TrackingLoss, tracking_loss
+from splatam_core.tracking.motion import SeenMotion
 from splatam_core.tracking.time_offset import TimeOffset
 from splatam_core.tracking.verdict import compare
 
@@ -71,6 +72,10 @@ class RenderAndCompareTracker:
             loss.total.backward()
             optimizer.step()
         return compare(_float64(best.pose), best.render, view, config)
+
+    def motion(self, view: View, before: View, T_now_before: Matrix) -> SeenMotion | None:
+        """See ``Tracker.motion``: it is not asked for, because no pose has evidence."""
+        return None
 
     def _is_poor(self, loss: TrackingLoss, view: View) -> bool:
         """Returns whether the depth error is large enough for more steps; the original compares the sum over the image."""

@@ -36,7 +36,9 @@ MAX_ACCELERATION, MAX_ANGULAR_ACCELERATION = 10.0, 60.0  # m/s^2, rad/s^2: a jer
 SAME_PLACE = 0.1  # m and rad: explanations that are nearer to each other are one
 _MUCH_BETTER = 1.05  # times as many cells
 _FINE_PIXEL_RAD = 0.01  # wider pixels leave more open: at half size, those of images less than some 250 pixels wide
-_SURE = 0.5  # of the error allowed: the images alone are sure enough
+_SURE = 0.5  # of the error allowed: the map alone is sure enough
+_WEAK = 0.75  # of the error allowed: beyond, the last frame is asked as well
+_ALIKE = 10  # frames in a row whose errors in a weak part of the map are the same one: together they count once
 _REENTRY = 0.9  # after a frame in doubt, the next must be so much surer to be trusted
 _JUMP_DEVIATIONS = 5.0
 _LEARNING_RATE = 0.1
@@ -143,33 +145,32 @@ class JudgeState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Blend:
-    """How the pose that the images give is combined with the predicted one.
+    """How the pose found in the map is combined with the predicted one and with the motion seen since the frame before.
 
     Attributes:
-        gain: [6, 6] by which the step from the predicted to the found pose is multiplied.
+        found: [6] twist from the predicted to the found pose.
+        combined: [6] from the predicted to the combined pose.
         covariance: [6, 6] of the combined pose.
         guessed: [6, 6] covariance of what the motion since the last pose was guessed to be.
+        unseen_share: how little of that motion the images tell, in the direction of which they tell least; 0 where they are sure.
     """
 
-    gain: Matrix
+    found: Matrix
+    combined: Matrix
     covariance: Matrix
     guessed: Matrix
+    unseen_share: float
 
-    @property
-    def unseen_share(self) -> float:
-        """How little of the motion the images tell, in the direction of which they tell least; 0 where they are sure."""
-        return 1 - min(max(float(np.linalg.eigvals(self.gain).real.min()), 0.0), 1.0)
+    @classmethod
+    def of_found(cls, found: Matrix, covariance: Matrix) -> _Blend:
+        """Takes the found pose as it is."""
+        return cls(found, found, covariance, np.zeros((6, 6)), 0.0)
 
-    @property
-    def is_all_image(self) -> bool:
-        """Whether the found pose is taken as it is."""
-        return bool((self.gain == np.eye(6)).all())
-
-    def applied(self, result: TrackingResult, step: Matrix) -> TrackingResult:
-        """Returns the result at the combined pose. step: [6] from the predicted to the found pose."""
-        if self.is_all_image:
+    def applied(self, result: TrackingResult) -> TrackingResult:
+        """Returns the result at the combined pose."""
+        if self.combined is self.found:
             return result
-        back = se3.exp(self.gain @ step) @ se3.exp(-step)
+        back = se3.exp(self.combined) @ se3.exp(-self.found)
         return replace(result, T_cam_world=back @ result.T_cam_world, T_cam_world_depth=back @ result.T_cam_world_depth)
 
 
@@ -235,10 +236,10 @@ class Judge:
         if result.evidence is None:
             return result, Verdict(Status.TRACKED)
         step = se3.log(result.T_cam_world_depth @ prediction.T_world_cam)
-        jump = self._jump(step, result.evidence.covariance, prediction)
-        blend = self._blend(result.evidence, prediction, config)
-        coarseness = max(1.0, result.evidence.pixel_rad / _FINE_PIXEL_RAD)
-        allowed_m = config.max_error_m * coarseness * (_REENTRY if self.state.is_in_doubt else 1)
+        blend = self._blend(step, result.evidence, prediction, config)
+        gone = (step, result.evidence.covariance) if prediction.seen is None else (blend.combined, blend.covariance)
+        jump = self._jump(*gone, prediction)
+        allowed_m = _allowed_m(result.evidence, config) * (_REENTRY if self.state.is_in_doubt else 1)
         weakness = _weakness(result.evidence, blend.covariance, allowed_m, config)
         if not weakness and is_ambiguous:
             weakness = 'two places explain the view equally well'
@@ -255,7 +256,7 @@ class Judge:
             is_in_doubt=bool(reason),
             unseen_s=blend.unseen_share * (self.state.unseen_s + min(prediction.seconds, _LONGEST_GAP)),
         )
-        covariance, result = blend.covariance, blend.applied(result, step)
+        covariance, result = blend.covariance, blend.applied(result)
         if reason:
             covariance = covariance + np.outer(step, step) + config.max_error_m**2 * np.eye(6)
         turn = np.kron(np.eye(2), result.T_cam_world[:3, :3].T)
@@ -267,17 +268,25 @@ class Judge:
             corrects=corrects,
         )
 
-    def _blend(self, evidence: Evidence, prediction: Prediction, config: TrackingConfig) -> _Blend:
-        """Returns how image and prediction are combined: a Kalman update where the images alone are not sure enough."""
-        if DEVIATIONS * max(_deviations(evidence.covariance)) <= _SURE * config.max_error_m or not math.isfinite(
-            prediction.seconds
-        ):
-            return _Blend(np.eye(6), evidence.covariance, np.zeros((6, 6)))
-        noise = self._noise(prediction)
-        predicted = self.state.covariance + noise
-        gain = np.linalg.solve(predicted + evidence.covariance, predicted).T
+    def _blend(self, step: Matrix, evidence: Evidence, prediction: Prediction, config: TrackingConfig) -> _Blend:
+        """Returns how map, prediction and motion seen are combined: a Kalman filter where the map alone is not sure enough."""
+        if _off(evidence.covariance) <= _SURE * config.max_error_m or not math.isfinite(prediction.seconds):
+            return _Blend.of_found(step, evidence.covariance)
+        noise, moved, unseen, in_map = self._noise(prediction), np.zeros(6), np.eye(6), evidence.covariance
+        if prediction.seen is not None:
+            gain, noise = _updated(noise, prediction.seen.covariance)
+            by_images = prediction.seen.T_now_before @ se3.inverse(prediction.T_world_cam_before)
+            moved, unseen = gain @ se3.log(by_images @ prediction.T_world_cam), np.eye(6) - gain
+            in_map = _ALIKE * in_map
+        gain, covariance = _updated(self.state.covariance + noise, in_map)
         kept = np.eye(6) - gain
-        return _Blend(gain, kept @ predicted @ kept.T + gain @ evidence.covariance @ gain.T, kept @ noise @ kept.T)
+        return _Blend(
+            found=step,
+            combined=moved + gain @ (step - moved),
+            covariance=covariance,
+            guessed=kept @ noise @ kept.T,
+            unseen_share=min(max(float(np.linalg.eigvals(kept @ unseen).real.max()), 0.0), 1.0),
+        )
 
     def _jump(self, step: Matrix, covariance: Matrix, prediction: Prediction) -> str:
         """Returns how far the camera has jumped, if it cannot have moved there; empty otherwise."""
@@ -337,9 +346,32 @@ class Judge:
         return np.diag(np.repeat(variances / 3, 3))
 
 
+def is_weak(result: TrackingResult, config: TrackingConfig) -> bool:
+    """Returns whether the map says so little about a pose that the motion since the last frame is worth a look."""
+    evidence = result.evidence
+    return evidence is not None and not _off(evidence.covariance) <= _WEAK * _allowed_m(evidence, config)
+
+
+def _allowed_m(evidence: Evidence, config: TrackingConfig) -> float:
+    """Returns by how much a pose may be off, m and rad: more in images of wide pixels."""
+    return config.max_error_m * max(1.0, evidence.pixel_rad / _FINE_PIXEL_RAD)
+
+
+def _off(covariance: Matrix) -> float:
+    """Returns by how much a pose of a covariance [6, 6] may be off, m and rad."""
+    return DEVIATIONS * max(_deviations(covariance))
+
+
+def _updated(before: Matrix, measured: Matrix) -> tuple[Matrix, Matrix]:
+    """Returns the gain of a Kalman update, and the covariance after it. before, measured: [6, 6] covariances."""
+    gain = np.linalg.solve(before + measured, before).T
+    kept = np.eye(6) - gain
+    return gain, kept @ before @ kept.T + gain @ measured @ gain.T
+
+
 def _weakness(evidence: Evidence, covariance: Matrix, allowed_m: float, config: TrackingConfig) -> str:
     """Returns why too little is known about the pose of a frame; empty where it is enough."""
-    off = DEVIATIONS * max(_deviations(covariance))
+    off = _off(covariance)
     if not off <= allowed_m:
         return f'its pose may be off by {100 * min(off, 99.0):.1f} cm (at most {100 * allowed_m:.1f} cm allowed)'
     explained = evidence.explained

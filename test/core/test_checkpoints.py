@@ -240,6 +240,22 @@ def test_state_is_read_back_as_it_was(state: SlamState, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.state.motion.velocity, state.motion.velocity, strict=True)
 
 
+def test_a_state_read_back_goes_on_alike(tmp_path: Path) -> None:
+    """Also where the map alone is not sure, so that the frame before counts."""
+    frames = open_sequence(SOURCE[0], width=WIDTH, max_frames=5)
+    slam = Slam(load_config('realtime', [*FAST, 'tracking.max_error_m=0.002']))
+    for index in range(4):
+        slam.process(frames[index])
+    state = read_checkpoint(Checkpoints(tmp_path, 2).save(slam.state(), PROGRESS)).state
+    poses = [slam.process(frames[4]).T_world_cam]
+    for start in (state, replace(state, last_view=None)):
+        other = Slam(state.config)
+        other.restore(start)
+        poses.append(other.process(frames[4]).T_world_cam)
+    np.testing.assert_array_equal(poses[0], poses[1])
+    assert not np.array_equal(poses[0], poses[2])
+
+
 def test_state_is_a_copy(state: SlamState) -> None:
     """A saved state must not change with later frames."""
     slam, frames = Slam(state.config), open_sequence(SOURCE[0], width=WIDTH, max_frames=6)

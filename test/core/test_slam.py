@@ -238,6 +238,21 @@ def test_trackers_find_a_known_motion(
     assert np.linalg.norm(se3.rotation_vector(result.T_cam_world[:3, :3])) < radians
 
 
+def test_motion_between_two_frames_is_seen_without_a_map(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """From standing still; of two views that have nothing in common nothing is said."""
+    frames, truth = room
+    config = load_config('realtime')
+    tracker = make_tracker(make_rasterizer('cpu', 1), config.tracking, 1)
+    before, now = (View.from_frame(frames[index], config.depth) for index in (4, 5))
+    seen = tracker.motion(now, before, np.eye(4))
+    assert seen is not None
+    off = se3.log(seen.T_now_before @ se3.inverse(truth[4]) @ truth[5])
+    assert np.linalg.norm(off[:3]) < 0.004 and np.linalg.norm(off[3:]) < 0.002  # fractions of a pixel, as above
+    assert off @ np.linalg.solve(seen.covariance, off) < 6 * 3**2
+    upside_down = dataclasses.replace(frames[5], rgb=frames[5].rgb[::-1].copy(), depth_m=frames[5].depth_m[::-1].copy())
+    assert tracker.motion(View.from_frame(upside_down, config.depth), before, np.eye(4)) is None
+
+
 def test_alignment_takes_up_what_the_exposure_does(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
     """With three fifths of the light the map does not look like the frame, unless gain and bias are found too."""
     frames, _ = room

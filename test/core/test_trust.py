@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from splatam_core.config import load_config
 from splatam_core.correction import correct
@@ -109,6 +110,26 @@ def test_odometry_bridges_a_covered_camera() -> None:
     for result, x in list(zip(results, places, strict=True))[23:]:
         assert result.status is Status.TRACKED and result.T_world_cam is not None
         assert abs(result.T_world_cam[0, 3] - x) < 0.02
+
+
+def faint(frame: RgbdFrame) -> RgbdFrame:
+    """A fifth of the texture's contrast."""
+    return replace(frame, rgb=(128 + 0.2 * (frame.rgb.astype(np.float32) - 128)).round().astype(np.uint8))
+
+
+def test_a_map_without_texture_is_crossed_by_the_motion_that_the_frames_show() -> None:
+    """As where the camera has passed too fast: what it mapped is a smear, and then it turns back, which nothing predicts."""
+    places = walk([0.02] * 8 + [0.01, 0.0, -0.01, *[-0.02] * 5, -0.01, 0.0, 0.01, *[0.02] * 5])
+    wall = Wall()
+    frames = [faint(wall.frame(x, (index + 1) * FRAME_NS)) for index, x in enumerate(places)]
+    slam = Slam(load_config('realtime', ['threads=1']))
+    run(slam, frames[:9])
+    with torch.no_grad():
+        slam.map.gaussians.rgb[:] = slam.map.gaussians.rgb.mean(dim=0)
+    slam.configure(load_config('realtime', ['threads=1', 'mapping.enabled=false']))
+    for result, x in zip(run(slam, frames[9:]), places[9:], strict=True):
+        assert result.status is Status.TRACKED and result.T_world_cam is not None
+        assert np.linalg.norm(result.T_world_cam[:3, 3] - (x, 0, 0)) < 0.04  # two pixels; without, 30 cm
 
 
 @pytest.fixture(scope='module')

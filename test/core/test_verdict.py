@@ -16,7 +16,7 @@ from splatam_core.rasterizer.native import make_native_aligner
 from splatam_core.tracking.base import TrackingResult
 from splatam_core.tracking.evidence import Evidence
 from splatam_core.tracking.gauss_newton import Alignment, GaussNewton
-from splatam_core.tracking.motion import MotionModel
+from splatam_core.tracking.motion import MotionModel, SeenMotion
 from splatam_core.tracking.pyramid import Level
 from splatam_core.tracking.time_offset import TimeOffset
 from splatam_core.tracking.verdict import Judge, Verdict
@@ -110,10 +110,11 @@ class Bench:
         self.judge.start()
         self.motion.observe(self.stamp_ns, np.eye(4))
 
-    def feed(self, *found: TrackingResult, after_ns: int = FRAME_NS) -> Verdict:
-        """Poses found from the last pose, and from the last one that may be trusted."""
+    def feed(self, *found: TrackingResult, after_ns: int = FRAME_NS, seen: SeenMotion | None = None) -> Verdict:
+        """Poses found from the last pose, and from the last one that may be trusted; the motion that the images show."""
         self.stamp_ns += after_ns
-        predictions = self.motion.predictions(self.stamp_ns)
+        first, *others = self.motion.predictions(self.stamp_ns)
+        predictions = [replace(first, seen=seen), *others]
         best, verdict = self.judge.choose(found[: len(predictions)], predictions[: len(found)], self.config)
         if verdict.status is Status.LOST:
             self.motion.stop()
@@ -122,12 +123,17 @@ class Bench:
         return verdict
 
 
-@pytest.fixture
-def bench() -> Bench:
+def moving() -> Bench:
+    """Returns a bench that has moved by 15 cm."""
     bench = Bench()
     for index in range(1, 31):
         assert bench.feed(result(at(0.005 * index))).status is Status.TRACKED
     return bench
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return moving()
 
 
 HERE, STEP = 0.15, 0.005  # metres: where the bench is, and how far it moves in a frame
@@ -144,6 +150,34 @@ def test_a_pose_that_is_poorly_determined_is_uncertain_and_says_so(bench: Bench)
     verdict = bench.feed(*[result(at(HERE + STEP * (index + 1)), deviation=0.02)] * 2, after_ns=20 * FRAME_NS)  # nothing predicted
     assert verdict.status is Status.UNCERTAIN and '3.6 cm allowed' in verdict.reason
     assert bench.feed(*[result(at(HERE + STEP * (index + 2)), deviation=0.005)] * 2).status is Status.TRACKED
+
+
+SEEN = SeenMotion(se3.inverse(at(STEP)), 0.001**2 * np.eye(6))
+
+
+def test_motion_that_is_seen_carries_the_camera_over_a_poor_map(bench: Bench) -> None:
+    """The map is off by 15 cm, and knows that it may be: the pose is the one that the motion leads to."""
+    for index in range(1, 21):
+        verdict = bench.feed(*[result(at(HERE + STEP * index + 0.15), deviation=0.1)] * 2, seen=SEEN)
+        assert verdict.status is Status.TRACKED, index
+        off = bench.motion.last_pose[0, 3] - HERE - STEP * index
+        assert verdict.covariance is not None and abs(off) < 3 * np.sqrt(verdict.covariance.relative[0, 0])
+        assert abs(off) < 0.01  # the map's variance is some thousand times larger, in each of twenty frames
+
+
+def test_motion_that_the_images_leave_open_changes_nothing(bench: Bench) -> None:
+    """A blank wall: neither the map nor the frame before tells where the camera went."""
+    found = result(at(HERE + STEP), deviation=0.1)
+    blank, without = SeenMotion(np.eye(4), 9.0 * np.eye(6)), moving()
+    first, second = bench.feed(found, seen=blank), without.feed(found)
+    assert first.covariance is not None and second.covariance is not None
+    np.testing.assert_allclose(first.covariance.relative, second.covariance.relative, rtol=0.01)
+    np.testing.assert_allclose(bench.motion.last_pose, without.motion.last_pose, atol=1e-4)
+
+
+def test_a_map_that_is_sure_needs_no_motion(bench: Bench) -> None:
+    bench.feed(result(at(HERE + STEP + 0.01)), seen=SEEN)
+    np.testing.assert_allclose(bench.motion.last_pose, at(HERE + STEP + 0.01), atol=1e-12)
 
 
 def test_a_pose_that_explains_only_parts_of_the_view_is_uncertain(bench: Bench) -> None:
