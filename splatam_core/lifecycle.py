@@ -250,12 +250,19 @@ class SlamLifecycle:
         self._last_seen = None if last is None else Observation(last, last.to(self.backend.device))
         self._num_frames, self._last_stamp_ns = state.num_frames, state.last_stamp_ns
 
-    def rest(self) -> None:
-        """Assumes that the camera is at its last pose, at rest; the next frame may have any stamp."""
+    def rest(self, *, is_new_time: bool = False) -> None:
+        """Assumes that the camera is at its last pose, at rest; the next frame may have any stamp.
+
+        Args:
+            is_new_time: True if stamps begin anew, so that frames so far have no place among those that follow.
+        """
+        if is_new_time:
+            self.graph.rest()
+        else:
+            self.graph.interrupt(self._newest())
         self._motion.place(self._motion.last_pose)
         self._relocaliser.interrupt()
         self._last_stamp_ns = self._last_seen = None
-        self.graph.rest()
 
     def render(self, T_world_cam: Matrix) -> RenderedView:
         """Renders the map from a pose [4, 4], through the camera of the frames.
@@ -291,8 +298,15 @@ class SlamLifecycle:
             The largest distance, in metres, by which a keyframe was moved.
         """
         before = self.graph.nodes.T_world_cam
-        self._correct(self.graph.settle())
-        return float(np.linalg.norm(self.graph.nodes.T_world_cam[:, :3, 3] - before[:, :3, 3], axis=1).max(initial=0.0))
+        self._correct(self.graph.settle(self._newest()))
+        after = self.graph.nodes.T_world_cam[: len(before)]
+        return float(np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1).max(initial=0.0))
+
+    def _newest(self) -> TrackedFrame | None:
+        """Returns the last frame, at the last pose to be trusted; None if no frame has come since the last rest."""
+        if self._last_stamp_ns is None:
+            return None
+        return TrackedFrame(self._num_frames - 1, self._last_stamp_ns, self._motion.trusted_pose, np.zeros((6, 6)))
 
     def _follow_graph(
         self, current: CurrentFrame, T_world_cam: Matrix, evidence: Evidence | None = None, *, is_found: bool = False

@@ -32,6 +32,9 @@ def unfailing_output(results: bool = True) -> Iterator[None]:
         try:
             yield
         finally:
+            for stream in (sys.stdout, sys.stderr):
+                if isinstance(stream, _Unfailing):
+                    stream.settle()
             sys.stdout, sys.stderr = before
 
 
@@ -51,6 +54,14 @@ class _Unfailing:
         """Writes what waits."""
         with suppress(OSError):
             self._stream.flush()
+
+    def settle(self) -> None:
+        """Drops what still waits and cannot be written: the interpreter would fail over it when it ends."""
+        try:
+            self._stream.flush()
+        except OSError:
+            with suppress(OSError), open(os.devnull, 'w', encoding='utf-8') as nowhere:
+                os.dup2(nowhere.fileno(), self._stream.fileno())
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)

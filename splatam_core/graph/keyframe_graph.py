@@ -53,6 +53,7 @@ _MARGIN = 0.03  # of the width
 
 
 _LINK_ARRAYS = 'T_first_second', 'information', 'limits', 'kinds'
+_SINGLE_ARRAYS = 'T_world_odom', 'num_corrections', 'look_at', 'last_correction_m', 'is_interrupted'
 
 
 class Kind(IntEnum):
@@ -123,6 +124,7 @@ class KeyframeGraph:
     _active: list[int]  # numbers of the nodes that edges connect
     _links: list[Link]
     _look_at: int | None  # node to be looked for anywhere with the next frame
+    _is_interrupted: bool  # frames were left out before the next one
 
     def __init__(self, config: SlamConfig, aligner: Aligner[Any] | None) -> None:
         """Begins without keyframes.
@@ -185,7 +187,7 @@ class KeyframeGraph:
             self._take_out_dropped(by_frame)
             self._join_window(len(self.nodes) - 1, by_frame)
             self._find_nearby(len(self.nodes) - 1, by_frame)
-        elif frame.is_found:
+        elif frame.is_found or self._is_interrupted:
             self._add(frame)
         elif self._look_at is not None and places is not None:
             node, self._look_at = self._look_at, None
@@ -197,14 +199,17 @@ class KeyframeGraph:
 
     def _add(self, frame: TrackedFrame) -> None:
         """Adds a node, and joins it to the one before."""
-        node = len(self.nodes)
+        if len(self.nodes) and frame.stamp_ns <= self.nodes.stamps_ns[-1]:
+            self.rest()
+        is_far = frame.is_found or self._is_interrupted
+        node, self._is_interrupted = len(self.nodes), False
         self.nodes = self.nodes.added(frame.index, frame.stamp_ns, frame.T_world_cam)
         self._active.append(node)
         if not node:
             return
         step = motions.between(self.nodes.placed[node - 1], frame.T_world_cam)
         gap = (frame.index - int(self.nodes.frames[node - 1])) / self._every
-        gap = max(gap, _GAP_TO_FOUND) if frame.is_found else gap
+        gap = max(gap, _GAP_TO_FOUND) if is_far else gap
         self._links.append(Link.measured(node - 1, node, step, Kind.ODOMETRY, frame.covariance, gap))
 
     def _take_out_dropped(self, by_frame: dict[int, PosedView]) -> None:
@@ -212,14 +217,23 @@ class KeyframeGraph:
         for node in [node for node in self._active[1:-1] if int(self.nodes.frames[node]) not in by_frame]:
             self._merge(node)
 
-    def settle(self) -> Corrections | None:
+    def settle(self, newest: TrackedFrame | None) -> Corrections | None:
         """Returns how poses and map are corrected so that they agree best with all edges; None without a loop.
 
         Without one the odometry is as good: it is measured against a map of many frames.
+
+        Args:
+            newest: the last frame, at which map and poses are corrected; it becomes a node. None = the last node.
         """
         if not self.num_loops:
             return None
+        self._extend(newest)
         return self._corrections(self._optimized(self._sure()))
+
+    def _extend(self, newest: TrackedFrame | None) -> None:
+        """Adds the last frame, if it comes after the last node: what is corrected there moves the frames before it as well."""
+        if newest is not None and len(self.nodes) and newest.index > self.nodes.frames[-1]:
+            self._add(newest)
 
     def _sure(self) -> list[Link]:
         return [link for link in self._links if link.kind not in (Kind.PENDING, Kind.FOUND)]
@@ -381,6 +395,16 @@ class KeyframeGraph:
         """Begins anew with the next keyframe, because time does; the map stays where it is."""
         self.nodes = Nodes()
         self._active, self._links, self._look_at = [], [], None
+        self._is_interrupted = False
+
+    def interrupt(self, newest: TrackedFrame | None) -> None:
+        """Goes on after frames were left out: the way to the next tracked frame is not known, but what was measured stays.
+
+        Args:
+            newest: the last frame before that; None = the last node.
+        """
+        self._extend(newest)
+        self._look_at, self._is_interrupted = None, True
 
     def drop_from(self, frame: int) -> None:
         """Forgets the keyframes of the frames from a number on."""
@@ -388,6 +412,12 @@ class KeyframeGraph:
         self._active = [node for node in self._active if node < len(self.nodes)]
         self._links = [link for link in self._links if max(link.first, link.second) < len(self.nodes)]
         self._look_at = None
+        last = len(self.nodes) - 1
+        if self._active and self._active[-1] < last:  # it was merged into a node that is gone; the next frame is joined to it
+            before = self._active[-1]
+            step, gap = motions.between(*self.nodes.T_world_cam[[before, last]]), np.diff(self.nodes.frames[[before, last]])[0]
+            self._links.append(Link.measured(before, last, step, Kind.ODOMETRY, np.zeros((6, 6)), float(gap) / self._every))
+            self._active.append(last)
 
     def corrected(self, stamps_ns: NDArray[np.int64], T_world_cam: Matrix) -> Matrix:
         """Returns poses [M, 4, 4] of frames, as they were published, after all corrections."""
@@ -406,6 +436,7 @@ class KeyframeGraph:
             'kinds': np.array([link.kind for link in self._links], dtype=np.int64),
             'T_world_odom': self.T_world_odom,
             'num_corrections': np.array(self.num_corrections),
+            'is_interrupted': np.array(self._is_interrupted),
             'look_at': np.array(-1 if self._look_at is None else self._look_at),
             'last_correction_m': np.array(self._last_correction_m),
         }
@@ -426,13 +457,14 @@ class KeyframeGraph:
         num_nodes, num_links = len(arrays['frames']), len(arrays['kinds'])
         shapes = {name: (num_nodes, *expected[name].shape[1:]) for name in Nodes.__dataclass_fields__}
         shapes |= {name: (num_links, *expected[name].shape[1:]) for name in ('pairs', *_LINK_ARRAYS)}
+        shapes |= {name: expected[name].shape for name in _SINGLE_ARRAYS}
         if broken := [name for name, shape in shapes.items() if arrays[name].shape != shape]:
             raise ValueError(f'graph: {", ".join(broken)} has the wrong shape')
         numbers = np.concatenate([arrays['pairs'].ravel(), arrays['active']])
-        if len(numbers) and not 0 <= numbers.min() <= numbers.max() < num_nodes:
-            raise ValueError(f'graph: pairs or active name nodes that are not among its {num_nodes}')
+        if arrays['look_at'] >= num_nodes or (len(numbers) and not 0 <= numbers.min() <= numbers.max() < num_nodes):
+            raise ValueError(f'graph: pairs, active or look_at name nodes that are not among its {num_nodes}')
         self.nodes = Nodes(**{name: arrays[name] for name in Nodes.__dataclass_fields__})
-        self._active = arrays['active'].tolist()
+        self._active, self._is_interrupted = arrays['active'].tolist(), bool(arrays['is_interrupted'])
         self._look_at = None if arrays['look_at'] < 0 else int(arrays['look_at'])
         columns = [arrays[name] for name in ('pairs', *_LINK_ARRAYS)]
         self._links = [

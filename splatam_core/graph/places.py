@@ -136,7 +136,7 @@ class Places:
         size = (len(frames),)
         if form != [('int64', size), ('int64', size), ('uint8', (len(points), 32)), ('float32', (len(points), 3))]:
             raise ValueError(f'places are {form}')
-        if (counts < 0).any() or counts.sum() != len(points) or not np.isfinite(points).all():
+        if (counts < 0).any() or (counts > len(points)).any() or counts.sum() != len(points) or not np.isfinite(points).all():
             raise ValueError(f'places have {counts.sum()} features of {len(points)}')
         begins = np.cumsum(counts) - counts
         self._keyframes = {

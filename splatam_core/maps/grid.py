@@ -28,6 +28,9 @@ OCCUPIED, FREE, UNKNOWN = 100, 0, -1
 """Values of a cell, as in nav_msgs/OccupancyGrid."""
 
 MAX_VOXELS = 1 << 28
+LAYERS_OF_A_VIEW = 64
+"""As many layers as a view takes memory for while it is carved, at least."""
+
 SHADES = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
 """Of map_server: a pixel of shade s is occupied with probability (255 - s) / 255."""
 
@@ -276,11 +279,16 @@ def window_of(T_grid_cam: Array, camera: PinholeCamera, settings: GridSettings) 
 
 
 def carve(view: DepthView, camera: PinholeCamera, T_grid_world: Array, settings: GridSettings) -> LocalGrid:
-    """Return what a view says about the voxels in front of it."""
+    """Return what a view says about the voxels in front of it.
+
+    Raises:
+        ExportError: there are too many.
+    """
     T_grid_cam = T_grid_world @ view.T_world_cam
     low, high = window_of(T_grid_cam, camera, settings)
-    columns, rows = high - low
-    shape = (int(rows), int(columns), settings.layers)
+    columns, rows = (int(size) for size in high - low)
+    _check_size(columns, rows, max(settings.layers, LAYERS_OF_A_VIEW))
+    shape = (rows, columns, settings.layers)
     world = points_of(view, camera, settings.range_m)
     points = world @ T_grid_world[:3, :3].T + T_grid_world[:3, 3]
     column, row = (np.floor(points[:, axis] / settings.resolution_m).astype(np.int64) - low[axis] for axis in (0, 1))
@@ -314,6 +322,18 @@ def _looks_through(
     return visible & (depth <= settings.range_m) & (measured > depth + settings.resolution_m)
 
 
+def _check_size(columns: int, rows: int, layers: int) -> None:
+    """Checks that so many voxels fit into memory.
+
+    Raises:
+        ExportError: they do not.
+    """
+    if columns * rows * layers > MAX_VOXELS:
+        raise ExportError(
+            f'a grid of {columns}x{rows} cells with {layers} layers is too large: choose a larger resolution or a smaller range'
+        )
+
+
 class Voxels:
     """Counts, for each voxel above the floor, the views that hit a surface in it and those that look through it."""
 
@@ -336,10 +356,7 @@ class Voxels:
         if rows and (low == self._low).all() and (high == end).all():
             return
         new_columns, new_rows = (int(size) for size in high - low)
-        if new_columns * new_rows * layers > MAX_VOXELS:
-            raise ExportError(
-                f'a grid of {new_columns}x{new_rows} cells with {layers} layers is too large: choose a larger --resolution'
-            )
+        _check_size(new_columns, new_rows, layers)
         before, offset, self._low = (self._hits, self._passes), self._low - low, low
         self._hits, self._passes = (np.zeros((new_rows, new_columns, layers), np.uint16) for _ in range(2))
         if rows:

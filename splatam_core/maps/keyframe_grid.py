@@ -153,8 +153,8 @@ class KeyframeGrid:
         depth_m = np.where(view.valid.numpy(), view.depth.numpy(), np.float32(0))
         T_world_cam = se3.inverse(self.T_grid_world) @ T_grid_cam
         local = carve(DepthView(depth_m, T_world_cam), view.camera, self.T_grid_world, self.settings)
-        self._parts[keyframe.frame] = _Part.of(local, T_grid_cam)
         self._voxels.add(local)
+        self._parts[keyframe.frame] = _Part.of(local, T_grid_cam)
 
     def _place(self, frame: int, T_grid_cam: Array) -> bool:
         """Moves the part of a keyframe to where the keyframe is now. Returns whether it had to."""
@@ -163,8 +163,8 @@ class KeyframeGrid:
         if distance_m < SAME_POSE_CELLS * self.settings.resolution_m and angle < SAME_POSE_RAD:
             return False
         new = _Part(part.low, part.shape, part.bits, part.T_grid_cam, T_grid_cam)
+        self._voxels.add(new.local(self.settings))  # first: it may be refused, and then nothing has changed
         self._voxels.add(part.local(self.settings), -1)
-        self._voxels.add(new.local(self.settings))
         self._parts[frame] = new
         return True
 

@@ -338,8 +338,8 @@ def _view(path: Path, what: str, arrays: Arrays, camera: PinholeCamera, spacing:
         raise CheckpointError(f'{refused}: it holds {found}, expected {expected}')
     if not np.isfinite(depth).all():
         raise CheckpointError(f'{refused}: its depth is not finite')
-    if type(spacing) is not float or not 1 <= spacing < math.inf:
-        raise CheckpointError(f'{refused}: spacing = {spacing!r}, expected at least 1')
+    if type(spacing) is not float or not 1 <= spacing <= camera.width:
+        raise CheckpointError(f'{refused}: spacing = {spacing!r}, expected 1 to {camera.width} pixels')
     return View(camera, torch.from_numpy(rgb8), torch.from_numpy(depth), spacing)
 
 

@@ -32,6 +32,7 @@ _PLACES = 'places.'
 _QUALITY = 95  # of JPEG
 _STEPS_PER_M = 1000
 _FARTHEST = 65535  # steps
+_RIGID = 1e-3  # error of a rotation after hours of float32
 
 
 def write_map_keyframes(path: Path, keyframes: Sequence[PosedView], places: Arrays) -> None:
@@ -89,8 +90,11 @@ def _keyframe(content: Content, index: int) -> PosedView:
         raise ValueError(f'depth of {steps.shape} {steps.dtype}: expected whole millimetres')
     if T_cam_world.shape != (4, 4) or T_cam_world.dtype != np.float32 or not np.isfinite(T_cam_world).all():
         raise ValueError('a pose is not finite')
-    if not 1 <= spacing < np.inf:
-        raise ValueError(f'spacing = {spacing}: expected at least 1')
+    R = T_cam_world[:3, :3].astype(np.float64)
+    if np.abs(R.T @ R - np.eye(3)).max() > _RIGID or (T_cam_world[3] != (0, 0, 0, 1)).any():
+        raise ValueError('a pose is no rigid motion')
+    if not 1 <= spacing <= camera.width:
+        raise ValueError(f'spacing = {spacing}: expected 1 to {camera.width} pixels')
     depth_m = (steps / np.float32(_STEPS_PER_M)).astype(np.float32)
     view = View(camera, torch.from_numpy(rgb), torch.from_numpy(depth_m), spacing)
     return PosedView(view, torch.from_numpy(T_cam_world.copy()), index - len(values['cameras']))

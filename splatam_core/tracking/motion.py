@@ -108,6 +108,11 @@ class MotionModel:
         """[4, 4] camera to world."""
         return self._T_world_cam
 
+    @property
+    def trusted_pose(self) -> Matrix:
+        """[4, 4] camera to world, the last one that is not uncertain."""
+        return self._T_world_cam if self._trusted_ns is None else self._T_world_cam_trusted
+
     def state(self) -> MotionState:
         """Returns the state, for ``restore``."""
         return MotionState(

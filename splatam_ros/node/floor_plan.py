@@ -114,10 +114,12 @@ def _floor(keyframes: Sequence[PosedView], options: NodeOptions) -> tuple[Matrix
     Raises:
         ExportError: they see none.
     """
-    chosen = keyframes[:: -(-len(keyframes) // MAX_LOOK)]
+    camera = keyframes[-1].view.camera  # a loaded map may be of another one
+    seen = [keyframe for keyframe in keyframes if keyframe.view.camera == camera]
+    chosen = seen[:: -(-len(seen) // MAX_LOOK)]
     views = [_depth_view(keyframe) for keyframe in chosen]
     try:
-        T_world_floor = se3.inverse(find_floor(views, chosen[0].view.camera, options.grid_range))
+        T_world_floor = se3.inverse(find_floor(views, camera, options.grid_range))
     except ExportError as error:
         raise ExportError(f'{error}; set base_frame, whose z axis is taken to point up') from None
     return T_world_floor[:3, 2], T_world_floor[:3, 3]

@@ -121,7 +121,7 @@ class Services:
         answer = Future()
         self._worker.call(self._outputs.occupancy_grid).add_done_callback(answer.set_result)
         done: FinishedCall = await answer
-        if not done.cancelled() and done.exception() is None and (grid := done.result()) is not None:
+        if self._failure(done) is None and (grid := done.result()) is not None:
             response.map = grid
         return response
 
@@ -139,17 +139,22 @@ class Services:
         return await answer
 
     def _response(self, done: FinishedCall) -> Trigger.Response:
+        failure = self._failure(done)
+        return _succeeded(done.result()) if failure is None else _failed(failure)
+
+    def _failure(self, done: FinishedCall) -> str | None:
+        """Returns why a call failed; None if it did not. Logs what nobody expects."""
         if done.cancelled():
-            return _failed('SLAM has stopped')
+            return 'SLAM has stopped'
         error = done.exception()
         if error is None:
-            return _succeeded(done.result())
+            return None
         if not isinstance(error, Exception):
-            return _failed(f'SLAM has stopped: {error!r}')
+            return f'SLAM has stopped: {error!r}'
         if not isinstance(error, (SplatamError, OSError)):
             self._node.get_logger().error(f'a service failed: {why(error)}; the traceback is logged at level debug')
             self._node.get_logger().debug(''.join(traceback.format_exception(error)))
-        return _failed(why(error))
+        return why(error)
 
 
 def _handler(action: Callable[[], Awaitable[Trigger.Response]]) -> Callable[..., Awaitable[Trigger.Response]]:

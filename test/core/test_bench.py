@@ -221,8 +221,10 @@ def test_a_cluster_that_loses_a_worker_runs_everything(cluster: Callable[[], sub
     for job in jobs:
         assert {path.name for path in job.folder.iterdir()} == {
             'trajectory.txt',
+            'trajectory_final.txt',
             'frames.csv',
             'map.ply',
+            'map.keyframes',
             'metrics.json',
             'config.yaml',
             'run.json',

@@ -178,6 +178,18 @@ def test_a_keyframe_that_sees_nothing_new_is_left_out() -> None:
     assert not plan.update([keyframe, *near], most=5)
 
 
+@pytest.mark.parametrize(
+    'settings', [GridSettings(0.01, 0.1, 1.0, 100.0), GridSettings(0.01, -10.0, 100.0, 4.0), GridSettings(0.02, 0.1, 0.12, 100.0)]
+)
+def test_a_view_that_does_not_fit_into_memory_is_refused_before_it_is_carved(settings: GridSettings) -> None:
+    """All within what the node's parameters allow."""
+    (keyframe,) = keyframes(Look([DepthView(np.full((CAM.height, CAM.width), 2.0, np.float32), np.eye(4))], np.eye(4)))
+    plan = KeyframeGrid(upright(np.array([0, -1.0, 0]), np.array([0, 1.2, 0]), np.eye(4)), settings)
+    for _ in range(2):  # refused once more: nothing of it was counted
+        with pytest.raises(ExportError, match='is too large'):
+            plan.update([keyframe], most=5)
+
+
 def test_the_axes_are_upright_and_point_where_the_first_camera_looks() -> None:
     level = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # optical axes, 1.5 m over the floor
     T_world_cam = np.eye(4)
@@ -198,7 +210,7 @@ def test_a_map_without_a_floor_has_no_grid() -> None:
     with pytest.raises(ExportError, match='nothing is within range'):
         grid_of([nothing], CAM, np.eye(4), SETTINGS)
     far = DepthView(nothing.depth_m, se3.exp(np.array([1e4, 1e4, 0, 0, 0, 0])))
-    with pytest.raises(ExportError, match='is too large: choose a larger --resolution'):
+    with pytest.raises(ExportError, match='is too large: choose a larger resolution'):
         grid_of([nothing, far], CAM, np.eye(4), SETTINGS)
 
 

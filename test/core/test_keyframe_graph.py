@@ -21,6 +21,7 @@ from splatam_core.tracking.torch_aligner import TorchAligner
 CAMERA = PinholeCamera(32, 24, 30.0, 30.0, 15.5, 11.5)
 EVERY = 5  # frames
 DRIFT = np.array([0.002, 0.001, 0, 0, 0.0005, 0])  # per keyframe: 8 cm there and back
+FRAME = TrackedFrame(0, 0, np.eye(4), np.zeros((6, 6)))
 CONFIG = load_config('realtime', ['graph.enabled=true', 'graph.loop_after=50'])
 
 
@@ -138,7 +139,7 @@ def test_a_state_that_is_none_is_refused() -> None:
     arrays = Drifting(there_and_back(10)).run().graph.arrays()
     faults = {
         'pairs': None, 'T_first_second': np.full_like(arrays['T_first_second'], np.nan), 'placed': arrays['placed'][1:],
-        'active': arrays['active'] + 1,
+        'active': arrays['active'] + 1, 'look_at': np.array(99), 'T_world_odom': np.eye(3),
     }  # fmt: skip
     for name, value in faults.items():
         broken = {key: array for key, array in {**arrays, name: value}.items() if array is not None}
@@ -151,3 +152,49 @@ def test_what_is_taken_back_leaves_the_graph() -> None:
     camera.graph.drop_from(EVERY * 20)
     assert camera.graph.nodes.frames[-1] < EVERY * 20 and camera.graph.pairs(loops=False).max() == len(camera.graph.nodes) - 1
     assert max(camera.graph._active) == len(camera.graph.nodes) - 1
+
+
+def test_what_is_taken_back_leaves_no_frame_without_a_place() -> None:
+    """A frame at which the map was corrected leaves the graph with the next keyframe, which may itself be taken back."""
+    camera = Drifting(there_and_back(60)).run()
+    graph = camera.graph
+    node = max(set(range(len(graph.nodes))) - set(graph._active))
+    graph.drop_from(int(graph.nodes.frames[node + 1]))
+    graph._add(replace(FRAME, index=1000, stamp_ns=1000, T_world_cam=graph.nodes.T_world_cam[-1]))
+    assert {number for link in graph._links for number in (link.first, link.second)} <= set(graph._active)
+    assert graph._active[-2:] == [node, node + 1]
+
+
+def drifted() -> Drifting:
+    """A camera that came back with loops, all of them to be used at the end."""
+    camera = Drifting(there_and_back(60))
+    camera.graph.configure(replace(CONFIG, graph=replace(CONFIG.graph, min_correction_m=1.0)))
+    camera.graph._pairs = camera.pairs
+    return camera.run()
+
+
+def test_frames_after_the_last_keyframe_move_with_it() -> None:
+    """They were tracked in the map before the correction, and end in the map after it."""
+    camera = drifted()
+    newest = replace(FRAME, index=EVERY * 59 + 4, stamp_ns=594, T_world_cam=camera.where)
+    corrections = camera.graph.settle(newest)
+    assert corrections is not None
+    stamps_ns = np.arange(590, 595)
+    final = camera.graph.corrected(stamps_ns, np.repeat(camera.where[None], 5, axis=0))
+    assert np.linalg.norm(final[0, :3, 3] - camera.where[:3, 3]) > 0.05
+    np.testing.assert_allclose(final, np.repeat((corrections.motions[-1] @ camera.where)[None], 5, axis=0), atol=1e-3)
+    later = corrections.motions[-1] @ camera.where  # tracked in the map after it
+    np.testing.assert_allclose(camera.graph.corrected(np.array([600]), later[None])[0], later, atol=1e-12)
+
+
+def test_a_pause_keeps_what_was_corrected() -> None:
+    camera = Drifting(there_and_back(60)).run()
+    stamps_ns, published = 10 * np.arange(60), np.array(camera.published)
+    final = camera.graph.corrected(stamps_ns, published)
+    camera.graph.interrupt(replace(FRAME, index=298, stamp_ns=598, T_world_cam=camera.where))
+    camera.graph.follow(replace(FRAME, index=299, stamp_ns=10_000, T_world_cam=camera.where), camera.keyframes)
+    np.testing.assert_array_equal(camera.graph.corrected(stamps_ns, published), final)
+    assert camera.graph.num_loops > 5 and camera.graph.nodes.frames[-2:].tolist() == [298, 299]
+    assert camera.graph._links[-1].information[0, 0] < 0.1 * camera.graph._links[-2].information[0, 0]  # nobody saw the way
+    camera.graph.follow(replace(FRAME, index=300, stamp_ns=1, T_world_cam=camera.where, is_found=True), camera.keyframes)
+    assert camera.graph.nodes.frames.tolist() == [300]  # time went back

@@ -9,14 +9,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from splatam_core.config import SlamConfig, load_config, preset_names, with_values
 from splatam_core.datasets.known_poses import FramesWithGroundTruth
 from splatam_core.datasets.registry import open_sequence
-from splatam_core.errors import ConfigError
+from splatam_core.errors import CheckpointError, ConfigError
 from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.graph.places import Places
+from splatam_core.images.view import View
+from splatam_core.mapping.posed import PosedView
+from splatam_core.runs.archive import Content, pack, read_archive
 from splatam_core.runs.checkpoints import Checkpoints, Progress, read_newest
-from splatam_core.runs.map_keyframes import read_map_keyframes, write_map_keyframes
+from splatam_core.runs.map_keyframes import KIND, VERSION, read_map_keyframes, write_map_keyframes
 from splatam_core.slam import Slam
 from splatam_core.state import SlamState
 from splatam_core.types import FrameResult, RgbdFrame, Status
@@ -155,6 +161,25 @@ def test_a_camera_started_in_a_saved_map_finds_itself(walk: Walk, tmp_path: Path
     found = next(index for index, result in enumerate(results) if result.status.is_trusted)
     assert results[found].is_relocalised and off(results[found], walk.true[found]) < 0.05
     assert len(slam.keyframes) >= len(walk.state.keyframes)
+
+
+@pytest.mark.parametrize('what', ['spacing', 'pose', 'counts'])
+def test_keyframes_that_no_camera_made_are_refused(tmp_path: Path, what: str) -> None:
+    """What only a later frame would trip over."""
+    view = View(PinholeCamera(32, 24, 30.0, 30.0, 15.5, 11.5), torch.zeros(24, 32, 3, dtype=torch.uint8), torch.ones(24, 32))
+    places = Places()
+    keyframes = [PosedView.at(view, np.eye(4), 0)] * 4
+    path = tmp_path / 'map.keyframes'
+    write_map_keyframes(path, keyframes, places.arrays())
+    content = read_archive(path, KIND, VERSION)
+    wrong = {
+        'spacing': ({'spacings': [1e308] * 4}, {}), 'pose': ({}, {'T_cam_world': np.full((4, 4, 4), 1e20, np.float32)}),
+        'counts': ({}, {'places.frames': np.arange(-4, 0), 'places.counts': np.full(4, 1 << 62)}),
+    }  # fmt: skip
+    values, arrays = wrong[what]
+    pack(KIND, VERSION, Content({**content.values, **values}, {**content.arrays, **arrays})).write(path)
+    with pytest.raises(CheckpointError, match={'pose': 'no rigid motion', 'counts': 'features of 0'}.get(what, what)):
+        read_map_keyframes(path)
 
 
 def test_a_map_without_keyframes_needs_a_pose(walk: Walk) -> None:

@@ -118,3 +118,11 @@ def test_without_viser_one_line_says_what_to_install(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(scene, 'find_spec', lambda name: None)
     with pytest.raises(ViewerError, match=r"pip install 'splatam_ros\[viewer\]'"):
         scene.open_server('127.0.0.1', 8480)
+
+
+@pytest.mark.parametrize(('host', 'port'), [('127.0.0.1', 70_000), ('203.0.113.1', 8080), ('no such host', 8080)])
+def test_an_address_that_cannot_be_used_is_refused_rather_than_waited_for(host: str, port: int) -> None:
+    """203.0.113.1 is nobody's (RFC 5737)."""
+    pytest.importorskip('viser')
+    with pytest.raises(ViewerError, match=f'the viewer cannot use {host}:{port}'):
+        scene.open_server(host, port)

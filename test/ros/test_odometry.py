@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -97,9 +99,10 @@ def test_the_covariance_of_the_tracker_is_that_of_the_body_in_the_map() -> None:
 
 
 def test_a_path_is_bounded_even_and_ends_with_the_newest() -> None:
-    history = PathHistory(10)
+    history, uncorrected = PathHistory(10), SimpleNamespace(slam=SimpleNamespace(graph=SimpleNamespace(num_corrections=0)))
     for number in range(1, 1001):
-        history.append(number)
-        assert len(history.poses) <= 10 and history.poses[-1] == number and history.poses[0] == 1
-    steps = np.diff(history.poses[:-1])
+        history.append(number, np.eye(4), number)
+        poses = history.poses(uncorrected)
+        assert len(poses) <= 10 and poses[-1] == number and poses[0] == 1
+    steps = np.diff(poses[:-1])
     assert (steps == steps[0]).all()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import socket
 from importlib.util import find_spec
 from typing import Any
 
@@ -41,6 +43,7 @@ def open_server(host: str, port: int) -> Any:
         ViewerError: viser is missing, or the address cannot be used.
     """
     check_viser()
+    _check_address(host, port)
     import rich
     import viser
 
@@ -54,6 +57,22 @@ def open_server(host: str, port: int) -> Any:
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
     server.scene.set_background_image(np.zeros((8, 8, 3), np.uint8))
     return server
+
+
+def _check_address(host: str, port: int) -> None:
+    """Checks that the address can be listened on: viser would wait for ever.
+
+    Raises:
+        ViewerError: it cannot be.
+    """
+    try:
+        family, kind, *_, where = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        with socket.socket(family, kind) as probe:
+            probe.bind((where[0], port, *where[2:]))
+    except (OSError, OverflowError, UnicodeError) as error:
+        if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
+            return
+        raise ViewerError(f'the viewer cannot use {host}:{port}: {error}') from None
 
 
 def _refuse_to_share(*_: object, **__: object) -> None:
