@@ -200,9 +200,8 @@ def overlaps(points: Tensor, camera: PinholeCamera, keyframes: Sequence[PosedVie
     near = _may_see(points, camera, T).nonzero()[:, 0]  # on a long path only a few
     homogeneous = torch.cat([points.T, points.new_ones(1, len(points))])  # [4, K]
     for chosen in near.split(_BATCH):
-        x, y, z = (
-            (T[chosen].reshape(-1, 4) @ homogeneous).view(len(chosen), 3, -1).unbind(1)
-        )  # [N, K] each, from one matrix product
+        seen = (T[chosen].reshape(-1, 4) @ homogeneous).view(len(chosen), 3, len(points))  # one matrix product; maybe of none
+        x, y, z = seen.unbind(1)  # [N, K] each
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         inside = (u > margin) & (u < camera.width - margin) & (v > margin) & (v < camera.height - margin) & (z > 0)
         shares[chosen] = inside.float().mean(dim=1)

@@ -345,6 +345,7 @@ def test_overlap_is_the_share_seen_inside_the_margin() -> None:
     assert overlaps(points, view.camera, [here], 8) == pytest.approx([15 * 7 / 768], abs=0.01)
     assert overlaps(points[:0], view.camera, [here], 0) == [0.0]
     assert overlaps(points, view.camera, [], 0) == []
+    assert overlaps(points, view.camera, [behind], 0) == [0.0]  # a camera that has turned away from all that it saw
 
 
 def test_keyframes_that_cannot_see_the_points_are_left_out_unseen() -> None:
