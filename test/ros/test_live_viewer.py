@@ -137,7 +137,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('viewer') / 'tiny'
     settings = [word for setting in FAST for word in ('--set', setting)]
     source = ['synthetic', '--width', '64', '--max-frames', '16', '--preset', 'quick']
-    assert main(['run', *source, *settings, '--out', str(folder)]) == 0
+    assert main(['run', *source, *settings, '--no-evaluate', '--out', str(folder)]) == 0
     return folder
 
 
