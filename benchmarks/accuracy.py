@@ -234,6 +234,7 @@ def plot(path: Path, title: str, outcomes: dict[str, Outcome]) -> None:
     above.legend(loc='upper left', fontsize='small')
     for axes in (above, below):
         axes.grid(alpha=0.3)
+    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
     pyplot.close(figure)
 
