@@ -316,7 +316,10 @@ class SlamLifecycle:
             return
         covariance = np.zeros((6, 6)) if evidence is None else evidence.covariance
         frame = TrackedFrame(current.index, current.frame.stamp_ns, T_world_cam, covariance, is_found)
-        self._correct(self.graph.follow(frame, self._mapper.keyframes, self.places))
+        try:
+            self._correct(self.graph.follow(frame, self._mapper.keyframes, self.places))
+        except np.linalg.LinAlgError as error:  # the frame is tracked and mapped: only its edges are missing
+            _log.warning('frame %d is not joined to the keyframe graph: %s', current.index, error)
 
     def _correct(self, corrections: Corrections | None) -> None:
         if corrections is not None:

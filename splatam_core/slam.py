@@ -25,11 +25,7 @@ MIN_SIDE = 8  # pixels
 
 @contextmanager
 def _solvable() -> Iterator[None]:
-    """Makes a view so odd that rounding leaves no system of equations to solve cost only itself.
-
-    Raises:
-        FrameError: it is.
-    """
+    """Raises FrameError for a view so odd that rounding leaves no system of equations to solve: it costs only itself."""
     try:
         yield
     except np.linalg.LinAlgError as error:
@@ -72,7 +68,8 @@ class Slam(SlamLifecycle):
             return current.result(verdict, T_world_cam, self, tracking=tracked)
         self._motion.time_offset = tracked.time_offset
         if verdict.corrects:
-            correct(self._mapper, self.graph, self._tracker, self.config.tracking, current.index)
+            with _solvable():
+                correct(self._mapper, self.graph, self._tracker, self.config.tracking, current.index)
         posed = PosedFrame(seen, tracked.T_cam_world, self.config.mapping, current.index)
         plan = self._mapper.schedule.plan(current.index, tracked.visible_fraction)
         self._mapper.densify(posed, plan)

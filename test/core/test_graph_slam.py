@@ -10,6 +10,7 @@ import pytest
 
 from splatam_core.config import load_config
 from splatam_core.datasets.registry import open_sequence
+from splatam_core.errors import FrameError
 from splatam_core.geometry import se3
 from splatam_core.slam import Slam
 from splatam_core.types import FrameResult, RgbdFrame, Status
@@ -78,3 +79,31 @@ def test_without_a_graph_nothing_is_kept(there_and_back: list[RgbdFrame]) -> Non
     assert slam.graph.summary.nodes == 0 and slam.optimize_graph() == 0
     poses = np.array([result.T_world_cam for result in results])
     assert (slam.graph.corrected(np.array([result.stamp_ns for result in results]), poses) == poses).all()
+
+
+@pytest.mark.parametrize(('broken', 'costs_the_frame'), [('track', True), ('_find_nearby', False)])
+def test_a_system_that_cannot_be_solved_costs_at_most_the_frame(
+    there_and_back: list[RgbdFrame],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    broken: str,
+    costs_the_frame: bool,
+) -> None:
+    """Wherever in a frame it is: in tracking, or in the graph, when the frame is in the map already."""
+    slam = slam_with('graph.enabled=true')
+    for frame in there_and_back[:2]:
+        slam.process(frame)
+
+    def unsolvable(*arguments: object) -> None:
+        raise np.linalg.LinAlgError('Singular matrix')
+
+    with monkeypatch.context() as patch:
+        patch.setattr(slam._tracker if broken == 'track' else slam.graph, broken, unsolvable)
+        if costs_the_frame:
+            with pytest.raises(FrameError, match='cannot be tracked: Singular matrix'):
+                slam.process(there_and_back[2])
+        else:
+            assert slam.process(there_and_back[2]).status is Status.TRACKED
+            assert 'frame 2 is not joined to the keyframe graph: Singular matrix' in caplog.text
+    assert slam.process(there_and_back[3]).status is Status.TRACKED
+    assert slam.process(there_and_back[4]).status is Status.TRACKED  # a keyframe
