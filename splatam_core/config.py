@@ -10,6 +10,7 @@ import difflib
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -497,9 +498,10 @@ SECTION_OF_METHOD = {
 """Which choice each section of settings belongs to."""
 
 
-def settings() -> list[Setting]:
+@cache
+def settings() -> tuple[Setting, ...]:
     """Returns every setting, in order."""
-    return list(settings_of(SlamConfig))
+    return tuple(settings_of(SlamConfig))
 
 
 def preset_names() -> list[str]:

@@ -129,7 +129,7 @@ def become(request: dict[str, Any]) -> None:
         os.dup2(source, target)
     os.close(output)
     os.close(nothing)
-    sys.stdout.reconfigure(write_through=True)
+    sys.stdout.reconfigure(write_through=bool(os.environ.get('PYTHONUNBUFFERED')))
     option, main, *arguments = request['arguments']
     if option == '-m':
         sys.argv = [main, *arguments]
@@ -144,7 +144,8 @@ def main() -> None:
     import gc
 
     import cv2  # noqa: F401
-    import torch  # noqa: F401
+    import torch
+    import torch._dynamo  # torch imports it at the first step of an optimizer: a second  # noqa: F401
 
     import splatam_core.slam
     import splatam_core.worker  # noqa: F401

@@ -10,9 +10,6 @@ import pickle
 import resource
 import shutil
 import signal
-import subprocess
-import sys
-import textwrap
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,6 +20,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from processes import run_code
 
 from splatam_core import cli
 from splatam_core.commands.shared import open_source
@@ -59,13 +57,6 @@ def splatam(*words: object) -> int:
     return cli.main([str(word) for word in words])
 
 
-def start(code: str, *words: object) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, '-c', textwrap.dedent(code), *map(str, words)],
-        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-    )  # fmt: skip
-
-
 def result(folder: Path) -> tuple[bytes, bytes, dict[str, object]]:
     metrics = json.loads((folder / 'metrics.json').read_text())
     kept = {name: value for name, value in metrics.items() if name not in MEASURED}
@@ -89,7 +80,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def broken_off(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run that was killed one frame after its second checkpoint; tests must not change it."""
     folder = tmp_path_factory.mktemp('killed') / 'run'
-    killed_after(7, arguments('quick', folder, '--checkpoint-every', EVERY))
+    killed_after(7, arguments('quick', folder, '--checkpoint-every', EVERY), folder.with_suffix('.log'))
     return folder
 
 
@@ -108,7 +99,7 @@ def state() -> SlamState:
     return slam.state()
 
 
-def killed_after(frames: int, words: list[str]) -> None:
+def killed_after(frames: int, words: list[str], log: Path) -> None:
     """Runs the command line in a process that is killed as soon as its folder has this many frames."""
     code = """
         import os, signal, sys
@@ -125,9 +116,8 @@ def killed_after(frames: int, words: list[str]) -> None:
         RunFolder.append = append_and_die
         sys.exit(cli.main(sys.argv[2:]))
     """
-    process = start(code, frames, *words)
-    output, _ = process.communicate(timeout=120)
-    assert process.returncode == -signal.SIGKILL, output
+    process = run_code(code, frames, *words, log=log)
+    assert process.wait() == -signal.SIGKILL, process.text
 
 
 # --- resuming ---
@@ -136,7 +126,7 @@ def killed_after(frames: int, words: list[str]) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize('preset', PRESETS)
 def test_a_run_that_was_killed_ends_as_if_it_had_not_been(preset: str, whole: dict[str, Path], tmp_path: Path) -> None:
-    killed_after(5, arguments(preset, tmp_path / 'run', '--checkpoint-every', EVERY))
+    killed_after(5, arguments(preset, tmp_path / 'run', '--checkpoint-every', EVERY), tmp_path / 'log')
     assert len((tmp_path / 'run' / 'trajectory.txt').read_text().splitlines()) == 5  # two after the checkpoint
     assert splatam('run', '--resume', tmp_path / 'run', '--no-evaluate') == 0
     assert result(tmp_path / 'run') == result(whole[preset])
@@ -154,8 +144,8 @@ def test_writing_checkpoints_changes_nothing(whole: dict[str, Path], tmp_path: P
 
 @pytest.mark.slow
 def test_killed_and_resumed_time_and_again(whole: dict[str, Path], tmp_path: Path) -> None:
-    killed_after(4, arguments('quick', tmp_path / 'run', '--checkpoint-every', 2, '--keep-checkpoints', 1))
-    killed_after(7, ['run', '--resume', str(tmp_path / 'run'), '--no-evaluate'])
+    killed_after(4, arguments('quick', tmp_path / 'run', '--checkpoint-every', 2, '--keep-checkpoints', 1), tmp_path / 'log')
+    killed_after(7, ['run', '--resume', str(tmp_path / 'run'), '--no-evaluate'], tmp_path / 'log')
     folder = tmp_path / 'run' / 'checkpoints'
     assert [path.name for path in checkpoint_paths(folder)] == ['000006.checkpoint']  # both arguments are kept by the run
     assert splatam('run', '--resume', tmp_path / 'run', '--no-evaluate') == 0
@@ -323,10 +313,10 @@ def test_a_process_killed_while_saving_leaves_the_checkpoint_before(state: SlamS
         old = read_newest(Path(sys.argv[1]))
         Checkpoints(Path(sys.argv[1]), 1).save(old.state, replace(old.progress, num_lines=99))
     """
-    killed = [start(code, tmp_path, files) for files in range(len(state.keyframes) + 1)]
+    counts = range(len(state.keyframes) + 1)
+    killed = [run_code(code, tmp_path, files, log=tmp_path.with_suffix(f'.{files}')) for files in counts]
     for process in killed:
-        output, _ = process.communicate(timeout=120)
-        assert process.returncode == -signal.SIGKILL, output
+        assert process.wait() == -signal.SIGKILL, process.text
     assert list(tmp_path.rglob('.*')), 'nothing was being written'
     assert path.read_bytes() == before and read_newest(tmp_path).progress == PROGRESS
     Checkpoints(tmp_path, 1).save(state, PROGRESS)
@@ -349,11 +339,11 @@ def test_a_process_killed_anywhere_while_saving_leaves_a_checkpoint(state: SlamS
             Checkpoints(Path(sys.argv[1]), 2).save(old.state, replace(old.progress, num_lines=old.progress.num_lines + 1))
     """
     for wait_s in (0.05, 0.13, 0.21):
-        process = start(code, tmp_path)
-        assert process.stdout is not None and process.stdout.readline() == 'ready\n'
+        process = run_code(code, tmp_path, log=tmp_path.with_suffix(f'.{wait_s}'))
+        process.wait_says('ready')
         time.sleep(wait_s)
-        process.kill()
-        process.communicate(timeout=60)
+        process.send(signal.SIGKILL)
+        process.wait()
         assert read_newest(tmp_path).state.num_frames == state.num_frames
     assert read_newest(tmp_path).progress.num_lines > PROGRESS.num_lines
 

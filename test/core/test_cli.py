@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from processes import Process, run_code
 
 from splatam_core.cli import COMMANDS, main
 from splatam_core.commands.shared import at_width
@@ -41,12 +42,11 @@ def splatam(*arguments: object) -> int:
     return main([str(argument) for argument in arguments])
 
 
-def start(*arguments: object, before: str = '', **options: object) -> subprocess.Popen[str]:
+def start(*arguments: object, log: Path, before: str = '') -> Process:
     """The command line as a process of its own. before: Python that it runs before."""
     hangup = 'signal.signal(signal.SIGHUP, signal.SIG_DFL)'  # the tests may have been started with nohup
     code = f'import os, signal, sys; {hangup}; {before}\nfrom splatam_core.cli import main; sys.exit(main())'
-    pipes = {'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE} | options
-    return subprocess.Popen([sys.executable, '-c', code, *map(str, arguments)], cwd=ROOT, text=True, **pipes)
+    return run_code(code, *arguments, log=log)
 
 
 def metrics(folder: Path) -> dict[str, object]:
@@ -264,31 +264,30 @@ def test_too_few_frames_for_a_trajectory_error_is_said(tmp_path: Path, capsys: p
 
 
 @pytest.fixture
-def long_run(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], Path]]:
+def long_run(tmp_path: Path) -> Iterator[tuple[Process, Path]]:
     """A run that has processed a few of its many frames."""
     arguments = ['--width', WIDTH, '--max-frames', 500, *SETTINGS, '--out', tmp_path / 'run']
-    process = start('run', SOURCE, *arguments)
+    process = start('run', SOURCE, *arguments, log=tmp_path / 'log')
     trajectory = tmp_path / 'run' / 'trajectory.txt'
     deadline_s = time.monotonic() + 60
     while not (trajectory.exists() and trajectory.read_text().count('\n') >= 6):  # some may be uncertain
-        assert process.poll() is None and time.monotonic() < deadline_s
+        assert process.is_running and time.monotonic() < deadline_s
         time.sleep(0.02)
     yield process, tmp_path / 'run'
-    process.kill()
-    process.communicate()
+    process.send(signal.SIGKILL)
+    process.wait()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.usefixtures('undrawn')
-def test_interrupt_saves_what_was_done(long_run: tuple[subprocess.Popen[str], Path], number: signal.Signals) -> None:
+def test_interrupt_saves_what_was_done(long_run: tuple[Process, Path], number: signal.Signals) -> None:
     process, folder = long_run
-    process.send_signal(number)
-    _, error = process.communicate(timeout=60)
-    assert process.returncode == 130
+    process.send(number)
+    assert process.wait() == 130
     m = metrics(folder)
     assert 3 <= m['frames'] < 500
-    assert f'stopped after {m["frames"]} of 500 frames' in error and 'Traceback' not in error
+    assert f'stopped after {m["frames"]} of 500 frames' in process.text and 'Traceback' not in process.text
     assert len((folder / 'trajectory.txt').read_text().splitlines()) == m['frames']
     assert m['num_gaussians'] == len(read_ply(folder / 'map.ply').means) > 0
     if number is signal.SIGINT:
@@ -299,29 +298,34 @@ def test_interrupt_saves_what_was_done(long_run: tuple[subprocess.Popen[str], Pa
 @pytest.mark.slow
 def test_a_terminal_that_is_gone_ends_no_run_started_with_nohup(tmp_path: Path) -> None:
     ignored = 'signal.signal(signal.SIGHUP, signal.SIG_IGN); os.kill(os.getpid(), signal.SIGHUP)'
-    process = start('run', SOURCE, *SMALL, *SETTINGS, '--no-evaluate', '--out', tmp_path / 'run', before=ignored)
-    assert process.wait(60) == 0 and metrics(tmp_path / 'run')['frames'] == FRAMES
-    assert 'stopping' not in process.communicate()[1]
+    arguments = ['run', SOURCE, *SMALL, *SETTINGS, '--no-evaluate', '--out', tmp_path / 'run']
+    process = start(*arguments, before=ignored, log=tmp_path / 'log')
+    assert process.wait() == 0 and metrics(tmp_path / 'run')['frames'] == FRAMES
+    assert 'stopping' not in process.text
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('what', ['closed', 'nobody reads', 'full'])
-def test_messages_that_cannot_be_printed_cost_nothing_of_the_run(tmp_path: Path, what: str) -> None:
-    reader, writer = os.pipe()
-    os.close(reader)
-    target = {'closed': None, 'nobody reads': writer, 'full': os.open('/dev/full', os.O_WRONLY)}[what]
-    closing = 'os.close(2); sys.stderr = None' if target is None else ''  # as Python finds it after 2>&-
+@pytest.mark.parametrize(
+    'closing',
+    [
+        'os.close(2); sys.stderr = None',  # as Python finds it after 2>&-
+        'reader, writer = os.pipe(); os.close(reader); os.dup2(writer, 2)',
+        "os.dup2(os.open('/dev/full', os.O_WRONLY), 2)",
+    ],
+    ids=['closed', 'nobody reads', 'full'],
+)
+def test_messages_that_cannot_be_printed_cost_nothing_of_the_run(tmp_path: Path, closing: str) -> None:
     arguments = ['run', SOURCE, *SMALL, *SETTINGS, '--no-evaluate', '--out', tmp_path / 'run']
-    process = start(*arguments, before=closing, stderr=target)
-    assert 'frames' in process.communicate(timeout=60)[0] and process.returncode == 0
+    process = start(*arguments, before=closing, log=tmp_path / 'log')
+    assert process.wait() == 0 and 'frames' in process.text
     assert metrics(tmp_path / 'run')['frames'] == FRAMES and len(read_ply(tmp_path / 'run' / 'map.ply').means) > 0
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures('undrawn')
-def test_kill_keeps_the_trajectory(long_run: tuple[subprocess.Popen[str], Path]) -> None:
+def test_kill_keeps_the_trajectory(long_run: tuple[Process, Path]) -> None:
     process, folder = long_run
-    process.kill()
+    process.send(signal.SIGKILL)
     process.wait()
     assert splatam('evaluate', folder, '--every', 100) == 0
     m = metrics(folder)

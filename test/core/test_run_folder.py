@@ -484,11 +484,13 @@ def test_the_last_of_a_million_frames_take_no_memory(tmp_path: Path) -> None:
     The first are only counted: their lines would take most of the time, and how long a file is costs no memory.
     """
     folder, some = RunFolder.create(tmp_path, CONFIG, NODE), frame_of_a_pixel(0)
-    for index in range(900_000):
-        folder._statistics.add(FrameRecord.of(result_of_day(index), 0.01, None))
-    for index in range(900_000, 1_000_001):
+    records = [FrameRecord.of(result_of_day(index), 0.01, None) for index in range(1000)]  # then they repeat
+    for _ in range(950):
+        for record in records:
+            folder._statistics.add(record)
+    for index in range(950_000, 1_000_001):
         folder.append(some, result_of_day(index), 0.01)
-        if index == 950_000:
+        if index == 955_000:
             tracemalloc.start()
     grown = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()

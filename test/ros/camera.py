@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
-from graph import Graph, Process
+from graph import Graph
 from numpy.typing import NDArray
+from processes import Process
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
-import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import rclpy
 from domains import reserve_domain
-from forked import Forked, can_fork, fork
+from processes import TIMEOUT_S, Process
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -24,7 +22,6 @@ from splatam_core.resources import config_dir
 
 ROOT = Path(__file__).resolve().parents[2]
 FRAMES = 12  # of the small recording that most tests play
-TIMEOUT_S = 60.0  # only ever waited out when a test fails; two busy cores make everything slow
 RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 
 
@@ -37,73 +34,6 @@ def environment(domain: int, log_folder: Path) -> dict[str, str]:
         'ROS_LOG_DIR': str(log_folder),
         'PYTHONUNBUFFERED': '1',
     }
-
-
-class Process:
-    """A process under test; its output goes into a file."""
-
-    def __init__(self, arguments: Sequence[str], environment: dict[str, str], log: Path, stdin: int = subprocess.DEVNULL) -> None:
-        self._log, self._process = log, _started(arguments, environment, log, stdin)
-
-    @property
-    def text(self) -> str:
-        return self._log.read_text(errors='replace')
-
-    @property
-    def lines(self) -> list[str]:
-        return self.text.splitlines()
-
-    @property
-    def is_running(self) -> bool:
-        return self._process.poll() is None
-
-    @property
-    def pid(self) -> int:
-        return self._process.pid
-
-    def send(self, number: signal.Signals) -> None:
-        self._process.send_signal(number)
-
-    def wait(self, timeout_s: float = TIMEOUT_S) -> int:
-        """Wait for its end; returns the exit code."""
-        try:
-            return self._process.wait(timeout_s)
-        except subprocess.TimeoutExpired:
-            raise AssertionError(f'still running after {timeout_s} s, and said:\n{self.text}') from None
-
-    def says(self, *parts: str) -> bool:
-        """Returns True if one line of the output contains all parts."""
-        return any(all(part in line for part in parts) for line in self.lines)
-
-    def wait_says(self, *parts: str, timeout_s: float = TIMEOUT_S) -> None:
-        wait_until(lambda: self.says(*parts) or not self.is_running, timeout_s, lambda: self.text)
-        assert self.says(*parts), f'not said: {parts}; but:\n{self.text}'
-
-    def end(self, grace_s: float = 3.0) -> None:
-        """Asked first: a participant that is killed leaves its shared memory, 35 MB, behind."""
-        if self.is_running:
-            self.send(signal.SIGTERM)
-        try:
-            self._process.wait(grace_s)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-
-
-def _started(arguments: Sequence[str], environment: dict[str, str], log: Path, stdin: int) -> subprocess.Popen[bytes] | Forked:
-    log.touch()
-    if stdin == subprocess.DEVNULL and can_fork(environment):
-        return fork(arguments, environment, log)
-    command = [sys.executable, *arguments]
-    with log.open('ab') as file:
-        return subprocess.Popen(command, cwd=ROOT, env=environment, stdin=stdin, stdout=file, stderr=subprocess.STDOUT)
-
-
-def wait_until(condition: Callable[[], object], timeout_s: float = TIMEOUT_S, explain: Callable[[], str] = lambda: '') -> None:
-    deadline_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline_s, f'not so within {timeout_s} s. {explain()}'
-        time.sleep(0.02)
 
 
 class Graph:

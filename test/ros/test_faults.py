@@ -16,7 +16,8 @@ import numpy as np
 from camera import SLAM, Camera, CompressedCamera, Live, position, run_node, still
 from control import Control
 from geometry_msgs.msg import PoseStamped
-from graph import TIMEOUT_S, Graph, Process, node_arguments
+from graph import Graph, node_arguments
+from processes import TIMEOUT_S, Process
 from std_msgs.msg import Header
 
 from msg_adapters import stamps

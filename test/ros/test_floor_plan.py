@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from camera import CAMERA_FRAME, LATCHED, MAKE, Camera, run_node
 from geometry_msgs.msg import Vector3
-from graph import Graph, Process
+from graph import Graph
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetMap
+from processes import Process
 from sensor_msgs.msg import Imu
 
 from msg_adapters import poses, stamps

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from camera import CAMERA_FRAME, LATCHED, MAKE, SLAM, Camera, run_node, still
 from geometry_msgs.msg import PoseStamped
-from graph import Graph, Process, node_arguments
+from graph import Graph, node_arguments
 from nav_msgs.msg import Odometry
+from processes import Process
 from rclpy.qos import QoSProfile
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import Reader, Writer

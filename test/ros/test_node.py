@@ -16,9 +16,10 @@ import pytest
 from camera import CAMERA_FRAME, LATCHED, MAKE, QUICK, SLAM, Camera, run_node, stamps_of, still
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from graph import FRAMES, TIMEOUT_S, Graph, Process, node_arguments
+from graph import FRAMES, Graph, node_arguments
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
+from processes import TIMEOUT_S, Process
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Header

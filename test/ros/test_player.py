@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 from geometry_msgs.msg import PoseStamped
-from graph import TIMEOUT_S, Graph, Process
+from graph import Graph
 from nav_msgs.msg import Path as PathMessage
+from processes import TIMEOUT_S, Process
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from graph import Graph, Process
+from graph import Graph
+from processes import Process
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags import rosbag1
