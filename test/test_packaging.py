@@ -75,6 +75,13 @@ def test_every_dependency_is_bounded_below_and_pinned_for_tests() -> None:
     assert {canonical(text) for text in metadata.requires(NAME)} <= pinned
 
 
+def test_every_extra_is_documented() -> None:
+    """But ``lint``, which is for those who change the code."""
+    page = (ROOT / 'docs' / 'install.md').read_text()
+    extras = {*metadata.metadata(NAME).get_all('Provides-Extra')} - {'lint'}
+    assert {extra for extra in extras if f'| `{extra}` |' not in page} == set()
+
+
 def test_the_configuration_is_found() -> None:
     assert {'quick.yaml', 'splatam.yaml', 'splatam_s.yaml'} <= {path.name for path in config_dir().glob('presets/*')}
 

@@ -14,6 +14,7 @@ from splatam_core.commands.shared import (
     Command,
     add_set_argument,
     add_source_arguments,
+    as_number,
     positive,
     say,
     source_of,
@@ -44,7 +45,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _seeds(text: str) -> tuple[int, ...]:
-    seeds = tuple(int(word) for word in text.split(',') if word.strip())
+    seeds = tuple(as_number(word, int) for word in text.split(',') if word.strip())
     if not seeds or len(set(seeds)) < len(seeds):
         raise argparse.ArgumentTypeError(f"'{text}': expected different whole numbers separated by commas, like 0,1,2")
     return seeds

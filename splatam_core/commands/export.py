@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from splatam_core.commands.shared import (
     Command,
     add_device_argument,
+    as_number,
     open_run,
     open_source,
     positive,
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from splatam_core.maps.export import Surface
+    from splatam_core.maps.grid import DepthView
     from splatam_core.rasterizer import Gaussians
     from splatam_core.runs.record import RunRecord
 
@@ -32,6 +34,7 @@ SUFFIXES = {
     'mesh': ('.ply',),
     'splatam': ('.npz',),
     'grid': ('.yaml',),
+    'octomap': ('.bt',),
 }
 """The forms of a map, and the files that each is written to."""
 
@@ -45,13 +48,13 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_device_argument(parser, "device to compute on (default: as the run's settings say)")
     parser.add_argument(
         'file', type=Path, metavar='FILE',
-        help='file to write: .ply, .splat or .spz (extra spz); .npz with --as splatam, .yaml with --as grid',
+        help='file to write: .ply, .splat or .spz (extra spz); .npz with --as splatam, .yaml with --as grid, .bt with --as octomap',
     )  # fmt: skip
     parser.add_argument(
         '--as', dest='form', choices=SUFFIXES, default='gaussians',
         help="'gaussians': for splat viewers (default); 'points': coloured centres; 'mesh': surface fused from rendered depth "
         "(needs pip install 'splatam_ros[mesh]'); 'splatam': params.npz for the original's programs; 'grid': floor plan for "
-        "ROS' map_server, .yaml and .pgm",
+        "ROS' map_server, .yaml and .pgm; 'octomap': occupied and free voxels for OctoMap, .bt",
     )  # fmt: skip
     parser.add_argument('--overwrite', action='store_true', help='replace FILE')
     parser.add_argument(
@@ -73,13 +76,17 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_number,
         default=6.0,
         metavar='M',
-        help='mesh, grid: ignore depth beyond M metres (default: %(default)s)',
+        help='mesh, grid, octomap: ignore depth beyond M metres (default: %(default)s)',
     )
     parser.add_argument(
-        '--every', type=positive, default=5, metavar='N', help='mesh, grid: look from every n-th frame (default: %(default)s)'
+        '--every',
+        type=positive,
+        default=5,
+        metavar='N',
+        help='mesh, grid, octomap: look from every n-th frame (default: %(default)s)',
     )
     for name, metres, what in (
-        ('resolution', 0.05, 'side of a cell'),
+        ('resolution', 0.05, 'side of a cell; octomap: of a voxel'),
         ('min-height', 0.1, 'lowest obstacle over the floor'),
         ('max-height', 1.0, 'highest obstacle over the floor: the height of the robot'),
     ):
@@ -89,7 +96,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _number(text: str) -> float:
-    value = float(text)
+    value = as_number(text, float)
     if not SMALLEST <= value <= LARGEST:
         raise argparse.ArgumentTypeError(f'{text} is not a number above 0, from {SMALLEST:g} to {LARGEST:g}')
     return value
@@ -126,6 +133,8 @@ def _write(args: argparse.Namespace) -> str:
         return f'{len(gaussians)} Gaussians and {len(run.trajectory)} poses'
     if args.form == 'grid':
         return _write_grid(args, run, gaussians)
+    if args.form == 'octomap':
+        return _write_octomap(args, run, gaussians)
     if args.form == 'mesh':
         return _write_surface(args.file, _mesh(args, run, gaussians))
     return _write_map(args, gaussians)
@@ -169,8 +178,7 @@ def _mesh(args: argparse.Namespace, run: RunRecord, gaussians: Gaussians) -> Sur
 
 
 def _write_grid(args: argparse.Namespace, run: RunRecord, gaussians: Gaussians) -> str:
-    from splatam_core.maps.grid import OCCUPIED, GridSettings, find_floor, grid_of, rendered_views, write_map_server
-    from splatam_core.rasterizer import rasterizer_for
+    from splatam_core.maps.grid import OCCUPIED, GridSettings, find_floor, grid_of, write_map_server
 
     if args.min_height >= args.max_height:
         raise ExportError(f'--min-height {args.min_height:g} is not below --max-height {args.max_height:g}')
@@ -178,13 +186,32 @@ def _write_grid(args: argparse.Namespace, run: RunRecord, gaussians: Gaussians) 
     picture = args.file.with_suffix('.pgm')
     if os.path.lexists(picture) and not args.overwrite:
         raise ExportError(f'{picture} exists: choose another name, or replace it with --overwrite')
-    (rasterizer, device), camera = rasterizer_for(run.config), run.camera_or_error()
-    poses = run.trajectory.T_world_cam[:: args.every]
-    views = rendered_views(gaussians.to(device), rasterizer, camera, poses, progress('rendering', 'view'))
+    camera, views = run.camera_or_error(), _depth_views(args, run, gaussians)
     grid = grid_of(views, camera, find_floor(views, camera, settings.range_m), settings)
     write_map_server(args.file, grid)
     rows, columns = grid.cells.shape
     return f'{columns}x{rows} cells of {settings.resolution_m:g} m, {int((grid.cells == OCCUPIED).sum())} of them occupied,'
+
+
+def _depth_views(args: argparse.Namespace, run: RunRecord, gaussians: Gaussians) -> list[DepthView]:
+    from splatam_core.maps.grid import rendered_views
+    from splatam_core.rasterizer import rasterizer_for
+
+    (rasterizer, device), camera = rasterizer_for(run.config), run.camera_or_error()
+    poses = run.trajectory.T_world_cam[:: args.every]
+    return rendered_views(gaussians.to(device), rasterizer, camera, poses, progress('rendering', 'view'))
+
+
+def _write_octomap(args: argparse.Namespace, run: RunRecord, gaussians: Gaussians) -> str:
+    from splatam_core.maps.grid import FREE, OCCUPIED, find_floor, volume_of
+    from splatam_core.maps.octomap import write_octomap
+
+    camera, views = run.camera_or_error(), _depth_views(args, run, gaussians)
+    T_grid_world = find_floor(views, camera, args.max_depth)
+    volume = volume_of(views, camera, T_grid_world, resolution_m=args.resolution, range_m=args.max_depth)
+    write_octomap(args.file, volume)
+    occupied, free = (int((volume.voxels == state).sum()) for state in (OCCUPIED, FREE))
+    return f'{occupied} occupied and {free} free voxels of {volume.resolution_m:g} m'
 
 
 def _write_splatam(path: Path, run: RunRecord, gaussians: Gaussians) -> None:
@@ -219,7 +246,7 @@ def _true_poses(run: RunRecord) -> NDArray[np.float64]:
 
 COMMAND = Command(
     'export',
-    "write a run's map as Gaussians, points, a mesh or a floor plan, or for the original's programs",
+    "write a run's map as Gaussians, points, a mesh, a floor plan or voxels, or for the original's programs",
     _add_arguments,
     export,
 )

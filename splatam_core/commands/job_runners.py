@@ -137,9 +137,10 @@ def run_on_dask(jobs: Sequence[Job], address: str) -> Iterator[Outcome]:
         JobError: the package is missing, or no scheduler answers.
     """
     distributed = _distributed()
+    _check_address(address)
     try:
         client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, ValueError) as error:  # TimeoutError is an OSError
+    except (OSError, ValueError, distributed.TimeoutError) as error:
         raise JobError(
             f'no Dask scheduler answers at {address}: {one_line(error) or "timed out"}; start one: dask scheduler'
         ) from None
@@ -163,6 +164,22 @@ def _distributed() -> Any:
     except ImportError as error:
         raise JobError(f"--dask needs Dask ({error}): pip install 'splatam_ros[dask]'") from None
     return distributed
+
+
+def _check_address(address: str) -> None:
+    """Checks an address before Dask does, which would wait for 40 s and print a traceback.
+
+    Raises:
+        JobError: no scheduler can have it.
+    """
+    from distributed.comm.addressing import get_address_host_port
+
+    try:
+        _, port = get_address_host_port(address)
+        if not 0 < int(port) < 1 << 16:
+            raise ValueError(f'there is no port {port}')
+    except ValueError as error:
+        raise JobError(f'--dask {address}: {one_line(error)}; expected an address like tcp://host:8786') from None
 
 
 def _received(job: Job, future: Any) -> Outcome:

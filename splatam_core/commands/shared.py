@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, TypeVar
 
 from splatam_core.config import DEVICES, computed_on
 from splatam_core.errors import SplatamError
@@ -26,6 +26,7 @@ MAX_NUMBER = 10**9
 """Of a whole number on the command line."""
 
 EXIT_INTERRUPTED = 130
+Number = TypeVar('Number', int, float)
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,9 +247,17 @@ sys.exit(main(sys.argv[2:]))
 """
 
 
+def as_number(text: str, kind: type[Number]) -> Number:
+    """Returns a number of a kind, for argparse, which otherwise would name the function that reads it."""
+    try:
+        return kind(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a {'whole ' if kind is int else ''}number") from None
+
+
 def positive(text: str) -> int:
     """Returns a whole number of at least 1, for argparse."""
-    value = int(text)
+    value = as_number(text, int)
     if value < 1:
         raise argparse.ArgumentTypeError(f'{value} is not at least 1')
     if value > MAX_NUMBER:
@@ -258,7 +267,7 @@ def positive(text: str) -> int:
 
 def seconds(text: str) -> float:
     """Returns a time of 0 to 10 s, for argparse."""
-    value = float(text)
+    value = as_number(text, float)
     if not 0 <= value <= 10:
         raise argparse.ArgumentTypeError(f'{text} is not from 0 to 10')
     return value

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatam_core.commands.shared import Command, add_device_argument, open_run, open_source, positive
-from splatam_core.errors import SplatamError, ViewerError
+from splatam_core.errors import SplatamError, ViewerError, one_line
 
 if TYPE_CHECKING:
     import numpy as np
@@ -47,6 +47,8 @@ def view(args: argparse.Namespace) -> int:
         raise ViewerError(f'{args.screenshot}: pictures are written as .png')
     run = None if args.source.is_file() else open_run(args.source, args.device)
     gaussians = read_ply(args.source) if run is None else run.read_map()
+    if args.screenshot is not None and not len(gaussians):
+        raise ViewerError(f'{args.source}: the map has no Gaussians, so there is nothing to take a picture of')
     server = open_server(args.host, args.port)
     shown: Shown = ShownMap(gaussians) if run is None else ShownRun(run, gaussians)
     scene = Scene(server)
@@ -169,7 +171,8 @@ def _corrected_path(run: RunRecord) -> NDArray[np.float64]:
     """Returns [N, 3] where the camera was in the final map; [0, 3] where that is where it was tracked: one line is enough then."""
     import numpy as np
 
-    positions = run.in_final_map().T_world_cam[:, :3, 3]
+    in_map = run.poses()
+    positions = np.array([in_map[int(stamp_ns)][:3, 3] for stamp_ns in run.trajectory.stamps_ns])
     moved_m = np.linalg.norm(positions - run.trajectory.T_world_cam[:, :3, 3], axis=1)
     return positions if moved_m.max() > SAME_M else positions[:0]
 
@@ -191,9 +194,25 @@ class _Images:
 
     def at(self, frame: int, T_world_cam: NDArray[np.float64]) -> NDArray[np.uint8]:
         """Returns the image [H, W, 3] of a frame."""
-        image = self._rendered(T_world_cam) if self._sequence is None else self._sequence[frame].rgb
+        image = self._recorded(frame)
+        if image is None:
+            image = self._rendered(T_world_cam)
         step = max(1, image.shape[1] // IMAGE_WIDTH)
         return image[::step, ::step]
+
+    def _recorded(self, frame: int) -> NDArray[np.uint8] | None:
+        """Returns the image of the recording; None if it cannot be read, from then on for every frame."""
+        if self._sequence is None:
+            return None
+        try:
+            if frame >= len(self._sequence):
+                raise ViewerError(f'it has {len(self._sequence)} frames')
+            image: NDArray[np.uint8] = self._sequence[frame].rgb
+        except (SplatamError, OSError) as error:
+            self._sequence = None
+            self.origin = f'rendered from the map, because frame {frame + 1} of the recording cannot be read: {one_line(error)}'
+            return None
+        return image
 
     def _rendered(self, T_world_cam: NDArray[np.float64]) -> NDArray[np.uint8]:
         import torch

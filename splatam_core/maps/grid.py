@@ -27,7 +27,12 @@ Array = NDArray[np.float64]
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1
 """Values of a cell, as in nav_msgs/OccupancyGrid."""
 
-MAX_VOXELS = 1 << 28
+MAX_VOXELS = 1 << 27
+"""Four bytes each. At 5 cm and 18 layers this is a square of 136 m."""
+
+BLOCK_CELLS = 64
+"""Memory grows by so many cells at a time, so that it is not copied for each view."""
+
 LAYERS_OF_A_VIEW = 64
 """As many layers as a view takes memory for while it is carved, at least."""
 
@@ -45,6 +50,9 @@ MIN_FREE_SHARE = 0.6
 
 MAX_TILT_DEG = 40.0
 """Largest angle between the floor's normal and the mean upward direction of the images."""
+
+HEIGHT_PERCENT = 0.1, 99.9
+"""Of the surface that is seen: lower and higher points are errors of depth."""
 
 FLOOR_TRIALS, FLOOR_TOLERANCE_M, MIN_FLOOR_SHARE, MAX_SHARE_BELOW = 60, 0.03, 0.02, 0.02
 
@@ -87,6 +95,23 @@ class DepthView:
 
     depth_m: NDArray[np.float32]
     T_world_cam: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Volume:
+    """Occupancy in three dimensions.
+
+    Attributes:
+        voxels: [rows, columns, layers] int8: OCCUPIED, FREE or UNKNOWN.
+        resolution_m: side length of a voxel.
+        low: column, row and layer of the first voxel, counted from the origin of the grid's axes.
+        T_grid_world: see ``Grid``.
+    """
+
+    voxels: NDArray[np.int8]
+    resolution_m: float
+    low: tuple[int, int, int]
+    T_grid_world: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -259,13 +284,41 @@ def grid_of(views: Sequence[DepthView], camera: PinholeCamera, T_grid_world: Arr
     Raises:
         ExportError: nothing is in range, or the grid would be too large.
     """
+    return _voxels_of(views, camera, T_grid_world, settings).grid(T_grid_world)
+
+
+def volume_of(
+    views: Sequence[DepthView], camera: PinholeCamera, T_grid_world: Array, resolution_m: float, range_m: float
+) -> Volume:
+    """Make an occupancy volume of depth images, from the lowest to the highest surface that they see.
+
+    Args:
+        views: the views.
+        camera: of the images.
+        T_grid_world: [4, 4] of ``find_floor`` or ``upright``.
+        resolution_m: side length of a voxel.
+        range_m: depth beyond this is ignored.
+
+    Raises:
+        ExportError: nothing is in range, or the volume would be too large.
+    """
+    parts = [points_of(view, camera, range_m, stride=4) @ T_grid_world[2, :3] + T_grid_world[2, 3] for view in views]
+    heights_m = np.concatenate(parts or [np.zeros(0)])
+    if not len(heights_m):
+        raise ExportError('there is no volume: nothing is within range')
+    lowest, highest = np.floor(np.percentile(heights_m, HEIGHT_PERCENT) / resolution_m).astype(int)
+    settings = GridSettings(resolution_m, lowest * resolution_m, (highest + 1) * resolution_m, range_m)
+    return _voxels_of(views, camera, T_grid_world, settings).volume(T_grid_world)
+
+
+def _voxels_of(views: Sequence[DepthView], camera: PinholeCamera, T_grid_world: Array, settings: GridSettings) -> Voxels:
     if not len(views):
         raise ExportError('there is no grid: no pose to look from')
     voxels = Voxels(settings)
     voxels.reserve([window_of(T_grid_world @ view.T_world_cam, camera, settings) for view in views])
     for view in views:
         voxels.add(carve(view, camera, T_grid_world, settings))
-    return voxels.grid(T_grid_world)
+    return voxels
 
 
 def window_of(T_grid_cam: Array, camera: PinholeCamera, settings: GridSettings) -> Window:
@@ -342,6 +395,21 @@ class Voxels:
         self._low = np.zeros(2, np.int64)
         self._hits = np.zeros((0, 0, settings.layers), np.uint16)
         self._passes = np.zeros_like(self._hits)
+        self._cells = np.zeros((0, 0), np.int8)
+        self._stale: Window | None = None  # cells whose counts have changed since they were computed
+
+    def check_room(self, windows: Sequence[Window]) -> Window:
+        """Return the cells that would be held with those of some windows.
+
+        Raises:
+            ExportError: there would be too many.
+        """
+        held = [(self._low, self._low + np.array(self._cells.shape[::-1]))] if self._cells.size else []
+        low, high = _around([*held, *windows])
+        low, high = low // BLOCK_CELLS * BLOCK_CELLS, -(-high // BLOCK_CELLS) * BLOCK_CELLS
+        columns, rows = (int(size) for size in high - low)
+        _check_size(columns, rows, self._settings.layers)
+        return low, high
 
     def reserve(self, windows: Sequence[Window]) -> None:
         """Make room for the cells of some windows.
@@ -349,32 +417,34 @@ class Voxels:
         Raises:
             ExportError: there would be too many.
         """
-        rows, columns, layers = self._hits.shape
-        low = np.min([*([self._low] if rows else []), *(window[0] for window in windows)], axis=0)
-        end = self._low + np.array([columns, rows])
-        high = np.max([*([end] if rows else []), *(window[1] for window in windows)], axis=0)
-        if rows and (low == self._low).all() and (high == end).all():
-            return
+        low, high = self.check_room(windows)
         new_columns, new_rows = (int(size) for size in high - low)
-        _check_size(new_columns, new_rows, layers)
-        before, offset, self._low = (self._hits, self._passes), self._low - low, low
-        self._hits, self._passes = (np.zeros((new_rows, new_columns, layers), np.uint16) for _ in range(2))
+        rows, columns = self._cells.shape
+        if (new_rows, new_columns) == (rows, columns):
+            return
+        before, offset, self._low = (self._hits, self._passes, self._cells), self._low - low, low
+        shape = new_rows, new_columns, self._settings.layers
+        self._hits, self._passes = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
+        self._cells = np.full(shape[:2], UNKNOWN, np.int8)
         if rows:
             place = slice(offset[1], offset[1] + rows), slice(offset[0], offset[0] + columns)
-            self._hits[place], self._passes[place] = before
+            self._hits[place], self._passes[place], self._cells[place] = before
 
     def add(self, local: LocalGrid, sign: int = 1) -> None:
         """Count what a view says; with sign -1, take it back."""
         rows, columns = local.hits.shape[:2]
+        if not rows or not columns:
+            return
         low = np.array(local.low)
-        self.reserve([(low, low + np.array([columns, rows]))])
-        column, row = low - self._low
-        place = slice(row, row + rows), slice(column, column + columns)
+        window = low, low + np.array([columns, rows])
+        self.reserve([window])
+        place = self._place(window)
         for counts, seen in ((self._hits, local.hits), (self._passes, local.passes)):
             if sign > 0:
                 counts[place] += seen
             else:
                 counts[place] -= seen
+        self._stale = window if self._stale is None else _around([self._stale, window])
 
     def grid(self, T_grid_world: Array) -> Grid:
         """Return the cells, without unknown margins.
@@ -382,18 +452,49 @@ class Voxels:
         Raises:
             ExportError: every cell is unknown.
         """
+        if self._stale is not None:
+            place, self._stale = self._place(self._stale), None
+            self._cells[place] = _cells(self._hits[place], self._passes[place])
         cell = self._settings.resolution_m
         origin_m = float(cell * self._low[0]), float(cell * self._low[1])
-        return _trimmed(Grid(self._cells(), cell, origin_m, T_grid_world))
+        return _trimmed(Grid(self._cells, cell, origin_m, T_grid_world))
 
-    def _cells(self) -> NDArray[np.int8]:
-        """Returns the cells [rows, columns]."""
-        hits, passes = self._hits.astype(np.float32), self._passes.astype(np.float32)
-        is_surface = (self._hits >= MIN_HITS) & (hits >= MIN_HIT_SHARE * (hits + passes))
-        was_through = (self._passes > 0) & ~is_surface
-        is_free = was_through.mean(axis=2) >= MIN_FREE_SHARE
-        cells = np.where(is_free, FREE, UNKNOWN)
-        return np.where(is_surface.any(axis=2), OCCUPIED, cells).astype(np.int8)
+    def volume(self, T_grid_world: Array) -> Volume:
+        """Return the voxels themselves.
+
+        Raises:
+            ExportError: every voxel is unknown.
+        """
+        is_surface, was_through = _seen(self._hits, self._passes)
+        if not (is_surface.any() or was_through.any()):
+            raise ExportError('there is no volume: nothing is within range')
+        voxels = np.where(is_surface, OCCUPIED, np.where(was_through, FREE, UNKNOWN)).astype(np.int8)
+        layer = round(self._settings.min_height_m / self._settings.layer_m)
+        low = int(self._low[0]), int(self._low[1]), layer
+        return Volume(voxels, self._settings.resolution_m, low, T_grid_world)
+
+    def _place(self, window: Window) -> tuple[slice, slice]:
+        """Returns the rows and columns of a window."""
+        (column, row), (end_column, end_row) = window[0] - self._low, window[1] - self._low
+        return slice(row, end_row), slice(column, end_column)
+
+
+def _around(windows: Sequence[Window]) -> Window:
+    """Return the smallest window that holds some others."""
+    return np.min([low for low, _ in windows], axis=0), np.max([high for _, high in windows], axis=0)
+
+
+def _cells(hits: NDArray[np.uint16], passes: NDArray[np.uint16]) -> NDArray[np.int8]:
+    """Return the cells [rows, columns] of counts [rows, columns, layers]."""
+    is_surface, was_through = _seen(hits, passes)
+    is_free = was_through.mean(axis=2) >= MIN_FREE_SHARE
+    return np.where(is_surface.any(axis=2), OCCUPIED, np.where(is_free, FREE, UNKNOWN)).astype(np.int8)
+
+
+def _seen(hits: NDArray[np.uint16], passes: NDArray[np.uint16]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return whether voxels hold a surface, and whether they do not and were looked through."""
+    is_surface = (hits >= MIN_HITS) & (hits >= np.float32(MIN_HIT_SHARE) * (hits.astype(np.float32) + passes))
+    return is_surface, (passes > 0) & ~is_surface
 
 
 def _trimmed(grid: Grid) -> Grid:

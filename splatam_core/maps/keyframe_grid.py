@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from splatam_core.errors import ExportError
 from splatam_core.geometry import se3
 from splatam_core.mapping.posed import PosedView
-from splatam_core.maps.grid import MIN_HITS, DepthView, Grid, GridSettings, LocalGrid, Voxels, carve
+from splatam_core.maps.grid import MIN_HITS, DepthView, Grid, GridSettings, LocalGrid, Voxels, carve, window_of
 
 Array = NDArray[np.float64]
 
@@ -107,16 +108,19 @@ class KeyframeGrid:
     Attributes:
         T_grid_world: [4, 4] the world in the grid's axes, z up and 0 on the floor.
         settings: what the grid shows.
+        left_out: why some of the keyframes are not in the grid, after ``update``; '' if all are.
     """
 
     def __init__(self, T_grid_world: Array, settings: GridSettings) -> None:
-        self.T_grid_world, self.settings = T_grid_world, settings
+        self.T_grid_world, self.settings, self.left_out = T_grid_world, settings, ''
         self._voxels = Voxels(settings)
         self._parts: dict[int, _Part] = {}
         self._skipped: dict[int, Array] = {}  # frames whose view others have, at this pose
 
     def update(self, keyframes: Iterable[PosedView], most: int) -> bool:
         """Take in keyframes that are new or were corrected. Those that the map has dropped stay as they were.
+
+        A keyframe that is too far away for a grid that holds it, too, is left out.
 
         Args:
             keyframes: in the host's memory, those of the map.
@@ -126,19 +130,34 @@ class KeyframeGrid:
             True if the grid changed.
 
         Raises:
-            ExportError: the grid would be too large.
+            ExportError: not even one keyframe fits into the grid.
         """
-        work = 0
+        work, refused = 0, []
         for keyframe in keyframes:
             if work >= most:
                 break
-            T_grid_cam = self.T_grid_world @ se3.inverse(keyframe.T_cam_world.numpy().astype(np.float64))
-            if keyframe.frame in self._parts:
-                work += self._place(keyframe.frame, T_grid_cam)
-            elif not self._is_known(keyframe.frame, T_grid_cam):
-                self._carve(keyframe, T_grid_cam)
-                work += 1
+            try:
+                work += self._take(keyframe)
+            except ExportError as error:
+                refused.append(error)
+        if refused and not self._parts:
+            raise refused[0]
+        self.left_out = f'{len(refused)} keyframes are left out: {refused[0]}' if refused else ''
         return work > 0
+
+    def _take(self, keyframe: PosedView) -> bool:
+        """Takes in a keyframe. Returns whether there was something to do.
+
+        Raises:
+            ExportError: the grid would be too large.
+        """
+        T_grid_cam = self.T_grid_world @ se3.inverse(keyframe.T_cam_world.numpy().astype(np.float64))
+        if keyframe.frame in self._parts:
+            return self._place(keyframe.frame, T_grid_cam)
+        if self._is_known(keyframe.frame, T_grid_cam):
+            return False
+        self._carve(keyframe, T_grid_cam)
+        return True
 
     def grid(self) -> Grid:
         """Return the grid.
@@ -150,6 +169,7 @@ class KeyframeGrid:
 
     def _carve(self, keyframe: PosedView, T_grid_cam: Array) -> None:
         view = keyframe.view
+        self._voxels.check_room([window_of(T_grid_cam, view.camera, self.settings)])
         depth_m = np.where(view.valid.numpy(), view.depth.numpy(), np.float32(0))
         T_world_cam = se3.inverse(self.T_grid_world) @ T_grid_cam
         local = carve(DepthView(depth_m, T_world_cam), view.camera, self.T_grid_world, self.settings)

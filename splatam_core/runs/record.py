@@ -172,7 +172,7 @@ class RunRecord(RunSettings):
             MapFileError: it cannot be read.
         """
         if not (self.path / MAP).is_file():
-            raise RunFolderError(f'{self.path} has no {MAP}: the run ended before it could be saved')
+            raise RunFolderError(f'{self.path} has no {MAP}: the run is still going on, or ended before it was saved')
         return read_ply(self.path / MAP)
 
     def camera_or_error(self) -> PinholeCamera:

@@ -75,6 +75,8 @@ class FloorPlan:
         except ExportError as error:
             self._warnings.warn('grid', f'nothing is published on ~/map/grid: {error}')
             return None
+        if plan.left_out:
+            self._warnings.warn('grid', f'~/map/grid shows a part of the map: {plan.left_out}')
         T_grid_corner = np.eye(4)
         T_grid_corner[:2, 3] = grid.origin_m
         T_map_corner = located.T_map_world @ se3.inverse(grid.T_grid_world) @ T_grid_corner

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,8 +46,8 @@ class ViewerFeed:
         self._process: subprocess.Popen[bytes] | None = None
         self._is_open = True
         self._wanted: set[bytes] = set()
-        self._epoch = self._num_frames = self._num_sent = 0
-        self._path: list[NDArray[np.float32]] = []
+        self._epoch = self._num_frames = 0
+        self._path: list[NDArray[np.float32]] = []  # what the viewer has not got yet
         self._newest: tuple[RgbdFrame, FrameResult] | None = None
         self._map_due_s = 0.0
 
@@ -82,7 +83,7 @@ class ViewerFeed:
     def begin_map(self) -> None:
         """Forget the path: a new map begins."""
         self._epoch += 1
-        self._path, self._num_sent, self._newest = [], 0, None
+        self._path, self._newest = [], None
 
     def take(self, frame: RgbdFrame, result: FrameResult, slam: Slam) -> None:
         """Take a frame that was processed, and answer what the viewer asks for.
@@ -92,6 +93,8 @@ class ViewerFeed:
             result: its result.
             slam: SLAM in its state after the frame.
         """
+        if not self._is_open:
+            return
         self._num_frames += 1
         self._newest = frame, result
         if result.status.is_trusted and result.T_world_cam is not None:
@@ -111,8 +114,15 @@ class ViewerFeed:
                 self._send(self._map_update(slam))
                 self._map_due_s = time.monotonic() + (time.monotonic() - begin_s) / MAP_SHARE
         except OSError:
-            self._is_open = False
-            self._logger.warning('the viewer has ended; the node goes on without')
+            self._end('the viewer has ended; the node goes on without')
+        except Exception as error:  # noqa: BLE001 - whatever it is, it costs the viewer alone
+            self._end(f'the viewer is ended by an unexpected {error!r}; the node goes on without')
+
+    def _end(self, why: str) -> None:
+        self._is_open, self._path, self._newest = False, [], None
+        self._logger.warning(why)
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)  # the viewer's process ends when it sees that
 
     def _receive(self) -> None:
         while True:
@@ -130,7 +140,7 @@ class ViewerFeed:
 
     def _frame_update(self, frame: RgbdFrame, result: FrameResult, graph: KeyframeGraph) -> FrameUpdate:
         camera, step = frame.camera, max(1, frame.camera.width // IMAGE_WIDTH)
-        begin, self._num_sent = self._num_sent, len(self._path)
+        path, self._path = self._path, []
         return FrameUpdate(
             epoch=self._epoch,
             num_frames=self._num_frames,
@@ -141,8 +151,7 @@ class ViewerFeed:
             pose=np.zeros((0, 4)) if result.T_world_cam is None else result.T_world_cam,
             camera=np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]),
             image=frame.rgb[::step, ::step],
-            path_begin=begin,
-            path=np.array(self._path[begin:], np.float32).reshape(-1, 3),
+            path=np.array(path, np.float32).reshape(-1, 3),
             nodes=graph.nodes.T_world_cam[:, :3, 3],
             loops=graph.pairs(loops=True).astype(np.int64),
         )

@@ -18,7 +18,7 @@ from splatam_core.errors import ViewerError
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.maps.viewer.packing import pack
 from splatam_core.maps.viewer.panel import Panel
-from splatam_core.maps.viewer.scene import Scene, address, open_server
+from splatam_core.maps.viewer.scene import CameraPath, Scene, address, open_server
 from splatam_core.types import MapSnapshot
 from splatam_ros.viewer.protocol import KINDS, MAX_MESSAGE, FrameUpdate, MapUpdate, SharedMemory, read
 
@@ -49,7 +49,7 @@ class LiveViewer:
         self._due_s = {kind.code: 0.0 for kind in KINDS}
         self._epoch = -1
         self._exact_s = self._line_s = 0.0
-        self._path: list[np.ndarray] = []
+        self._path = CameraPath()
         self._counts: deque[tuple[float, int]] = deque()
 
     def step(self) -> bool:
@@ -77,16 +77,16 @@ class LiveViewer:
         now_s = time.monotonic()
         self._due_s[update.code] = now_s + FRAME_PERIOD_S
         self._begin(update.epoch)
-        self._path[update.path_begin :] = list(update.path.copy())
+        self._path.extend(update.path.copy())
         if len(update.pose):
             pose, (width, height, fx, fy, cx, cy) = update.pose.copy(), update.camera
             camera = PinholeCamera(int(width), int(height), float(fx), float(fy), float(cx), float(cy))
             self._scene.show_camera(pose, camera, update.image.copy())
             if self._panel.follows:
                 self._scene.follow(pose)
-        if now_s >= self._line_s and len(self._path) > 1:
+        if now_s >= self._line_s:
             self._line_s = now_s + LINE_PERIOD_S
-            self._scene.show_line('trajectory', np.array(self._path), PATH_COLOR)
+            self._scene.show_line('trajectory', self._path.points(), PATH_COLOR)
             self._scene.show_line('corrected', update.nodes, CORRECTED_COLOR)
             self._scene.show_segments('loops', update.nodes[update.loops], LOOP_COLOR)
         self._panel.say(self._status(update, now_s))
@@ -120,7 +120,7 @@ class LiveViewer:
 
     def _begin(self, epoch: int) -> None:
         if epoch != self._epoch:
-            self._epoch, self._path = epoch, []
+            self._epoch, self._path = epoch, CameraPath()
             self._scene.clear()
 
 

@@ -35,8 +35,7 @@ class FrameUpdate:
         pose: [4, 4] T_world_cam; [0, 4] where it is lost.
         camera: [6] width, height, fx, fy, cx, cy.
         image: [H, W, 3] what the camera saw, made smaller.
-        path_begin: number of the first point of ``path``.
-        path: [N, 3] positions of the trusted frames since the last update, as tracked.
+        path: [N, 3] positions of the trusted frames since the last update of the same epoch, as tracked.
         nodes: [K, 3] positions of the keyframes after all corrections of the graph, in order.
         loops: [L, 2] numbers of the keyframes that loops connect.
     """
@@ -51,7 +50,6 @@ class FrameUpdate:
     pose: NDArray[np.float64]
     camera: NDArray[np.float64]
     image: NDArray[np.uint8]
-    path_begin: int
     path: NDArray[np.float32]
     nodes: NDArray[np.float64]
     loops: NDArray[np.int64]
@@ -95,6 +93,7 @@ class SharedMemory:
 
     def at_least(self, size: int) -> memoryview:
         """Return the memory, at least ``size`` bytes; it grows by more than that, since a map grows frame by frame."""
+        size = max(1, size)  # of nothing, too, such as a map before the first frame
         if self._map is None or len(self._map) < size:
             if os.fstat(self.descriptor).st_size < size:
                 os.ftruncate(self.descriptor, max(1 << 16, size + size // 2))

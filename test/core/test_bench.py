@@ -95,6 +95,10 @@ def test_a_run_that_fails_does_not_stop_the_others(
         (['--presets', 'quick,quickest'], "'quickest'"),
         (['--presets', 'quick,quick'], 'different presets'),
         (['--presets', ''], 'different presets'),
+        *(
+            (['--presets', 'quick', '--dask', address], f'--dask {address}: ')
+            for address in ('foo', 'tcp://', 'http://127.0.0.1:8786', '127.0.0.1:99999', 'tcp://127.0.0.1:x', '')
+        ),
         (['--presets', 'quick', '--dask', 'tcp://127.0.0.1:1'], 'no Dask scheduler answers at tcp://127.0.0.1:1'),
     ],
 )
@@ -108,10 +112,23 @@ def test_what_cannot_be_run_is_refused_before_it_begins(
     assert message in capsys.readouterr().err and not (tmp_path / 'b').exists()
 
 
-@pytest.mark.parametrize('seeds', ['0,0', 'x', ''])
-def test_wrong_seeds_are_refused(seeds: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ('option', 'text', 'message'),
+    [
+        ('--seeds', '0,0', 'expected different whole numbers separated by commas'),
+        ('--seeds', '', 'expected different whole numbers'),
+        ('--seeds', '0,x', "'x' is not a whole number"),
+        ('--jobs', 'many', "'many' is not a whole number"),
+        ('--jobs', '0', '0 is not at least 1'),
+        ('--max-interval', 'short', "'short' is not a number"),
+    ],
+)
+def test_wrong_numbers_are_refused_in_plain_words(
+    option: str, text: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
-        bench('synthetic', '--presets', 'quick', '--seeds', seeds, '--out', tmp_path / 'b')
+        bench('synthetic', '--presets', 'quick', option, text, '--out', tmp_path / 'b')
+    assert message in capsys.readouterr().err
 
 
 def test_recordings_of_equal_names_get_folders_of_their_own() -> None:

@@ -286,6 +286,16 @@ def test_export_of_a_grid_needs_a_floor(run: RunRecord, tmp_path: Path, capsys: 
     assert 'm.pgm exists' in capsys.readouterr().err
 
 
+def test_export_of_voxels_has_the_axes_of_the_grid(run: RunRecord, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert splatam('export', run.path, tmp_path / 'm.bt', '--as', 'octomap', '--every', 1) == 0
+    assert 'free voxels of 0.05 m are in' in capsys.readouterr().out
+    assert splatam('export', run.path, tmp_path / 'm.yaml', '--as', 'grid', '--every', 1) == 0
+    matrix = (tmp_path / 'm.yaml').read_text().split('T_grid_world:\n')[1].split('image:')[0]
+    assert matrix in (tmp_path / 'm.bt').read_bytes().decode(errors='replace')
+    assert splatam('export', run.path, tmp_path / 'n.bt', '--as', 'octomap', '--resolution', 1e-4) == 2
+    assert 'is too large: choose a larger resolution' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize('value', ['1e300', '1e-300', 'inf', 'nan', '-1'])
 def test_lengths_beyond_any_use_are_refused(value: str, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ('resolution', 'max-depth', 'max-height', 'voxel', 'min-opacity'):

@@ -26,14 +26,19 @@ from splatam_core.maps.grid import (
     DepthView,
     Grid,
     GridSettings,
+    LocalGrid,
+    Volume,
+    Voxels,
     find_floor,
     grid_of,
     points_of,
     rendered_views,
     upright,
+    volume_of,
     write_map_server,
 )  # fmt: skip
 from splatam_core.maps.keyframe_grid import KeyframeGrid
+from splatam_core.maps.octomap import write_octomap
 from splatam_core.rasterizer import Gaussians, make_rasterizer
 
 WIDTH, VIEWS, STEP = 160, 30, 4  # a full turn
@@ -190,6 +195,51 @@ def test_a_view_that_does_not_fit_into_memory_is_refused_before_it_is_carved(set
             plan.update([keyframe], most=5)
 
 
+def test_a_keyframe_too_far_away_costs_its_own_part_only() -> None:
+    """As after a jump, or in a building that is larger than memory."""
+    view = DepthView(np.full((CAM.height, CAM.width), 2.0, np.float32), np.eye(4))
+    (keyframe,) = keyframes(Look([view], np.eye(4)))
+    plan = KeyframeGrid(upright(np.array([0, -1.0, 0]), np.array([0, 1.2, 0]), np.eye(4)), SETTINGS)
+    at = [PosedView.at(keyframe.view, se3.exp(np.array([x, 0, 0, 0, 0, 0])), n) for n, x in enumerate((0.0, 1e4, 0.1, 1.0))]
+    plan.update(at[:1] + at[2:], most=5)
+    alone = plan.grid()
+    assert plan.left_out == '' and (alone.cells == OCCUPIED).any()
+    for _ in range(2):
+        assert not plan.update(at, most=5)
+        assert plan.left_out.startswith('1 keyframes are left out: a grid of ') and 'is too large' in plan.left_out
+    moved = PosedView.at(keyframe.view, se3.exp(np.array([1e4, 0, 0, 0, 0, 0])), 3)  # a correction that cannot be followed
+    plan.update([*at[:3], moved], most=5)
+    assert plan.left_out.startswith('2 keyframes')
+    np.testing.assert_array_equal(plan.grid().cells, alone.cells)
+
+
+def test_a_grid_in_steps_is_that_of_all_at_once() -> None:
+    """Whatever was added, moved and asked for in between, and wherever memory began."""
+    rng = np.random.default_rng(0)
+
+    def local() -> LocalGrid:
+        shape = (*rng.integers(1, 90, 2), SETTINGS.layers)
+        return LocalGrid(
+            (int(rng.integers(-150, 150)), int(rng.integers(-150, 150))), rng.random(shape) < 0.3, rng.random(shape) < 0.8
+        )
+
+    parts = [local() for _ in range(12)]
+    steps, at_once = Voxels(SETTINGS), Voxels(SETTINGS)
+    for part in parts:
+        steps.add(part)
+        if rng.random() < 0.5:
+            steps.grid(np.eye(4))
+    for part in parts[::3]:
+        steps.add(part, -1)
+    kept = [part for index, part in enumerate(parts) if index % 3]
+    for part in reversed(kept):
+        at_once.add(part)
+    found, expected = steps.grid(np.eye(4)), at_once.grid(np.eye(4))
+    np.testing.assert_array_equal(found.cells, expected.cells)
+    assert found.origin_m == expected.origin_m
+    assert {*np.unique(found.cells)} == {FREE, OCCUPIED, UNKNOWN}
+
+
 def test_the_axes_are_upright_and_point_where_the_first_camera_looks() -> None:
     level = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # optical axes, 1.5 m over the floor
     T_world_cam = np.eye(4)
@@ -225,6 +275,71 @@ def test_files_are_read_by_the_rules_of_map_server(tmp_path: Path) -> None:
     read = np.where(p > meta['occupied_thresh'], OCCUPIED, np.where(p < meta['free_thresh'], FREE, UNKNOWN))
     assert read.tolist() == cells.tolist()
     assert 'T_grid_world' in (tmp_path / 'map.yaml').read_text()
+
+
+def read_octree(content: bytes) -> dict[tuple[int, int, int], int]:
+    """The leaves of an octree by their keys, read as OctoMap's ``readBinaryNode`` does; and its header is right."""
+    header, _, data = content.partition(b'\ndata\n')
+    assert header.startswith(b'# Octomap OcTree binary file\n')
+    stated = dict(line.split() for line in header.decode().splitlines() if not line.startswith('#'))
+    assert stated.keys() == {'id', 'size', 'res'} and stated['id'] == 'OcTree'
+    leaves: dict[tuple[int, int, int], int] = {}
+    pairs, size = iter(data), 1
+
+    def read(key: tuple[int, ...], width: int) -> None:
+        nonlocal size
+        bits = next(pairs) | next(pairs) << 8
+        found = [(child, bits >> 2 * child & 3) for child in range(8) if bits >> 2 * child & 3]
+        size += len(found)
+        for child, kind in found:
+            at = tuple(place + width * (child >> axis & 1) for axis, place in enumerate(key))
+            if kind == 3:
+                read(at, width // 2)
+            else:
+                assert width == 1
+                leaves[at] = {1: FREE, 2: OCCUPIED}[kind]
+
+    read((0, 0, 0), 1 << 15)
+    assert next(pairs, None) is None and size == int(stated['size'])
+    return leaves
+
+
+def test_voxels_are_read_by_the_rules_of_octomap(tmp_path: Path) -> None:
+    rng, low = np.random.default_rng(0), (-7, 3, -2)
+    voxels = rng.choice(np.array([UNKNOWN, FREE, OCCUPIED], np.int8), (5, 9, 4))
+    write_octomap(tmp_path / 'map.bt', Volume(voxels, 0.05, low, np.eye(4)))
+    leaves = read_octree((tmp_path / 'map.bt').read_bytes())
+    expected = {
+        tuple((1 << 15) + np.array(low) + (column, row, layer)): voxels[row, column, layer]
+        for row, column, layer in np.argwhere(voxels != UNKNOWN)
+    }
+    assert leaves == expected
+    with pytest.raises(ExportError, match='too large for an octree'):
+        write_octomap(tmp_path / 'far.bt', Volume(voxels, 0.05, (1 << 15, 0, 0), np.eye(4)))
+
+
+BESIDE = 0.07 * np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)])
+"""Metres: half the diagonal of a voxel, and the error of measured depth."""
+
+
+@pytest.mark.slow
+def test_voxels_are_those_of_the_room() -> None:
+    """Looked through inside, a surface at walls, floor and furniture."""
+    look = look_around(20)
+    T_grid_world = find_floor(look.views, CAM, SETTINGS.range_m)
+    volume = volume_of(look.views, CAM, T_grid_world, resolution_m=0.05, range_m=SETTINGS.range_m)
+    T_room_grid = look.T_room_world @ se3.inverse(T_grid_world)
+    index = np.argwhere(volume.voxels != UNKNOWN)
+    centres = volume.resolution_m * (index[:, [1, 0, 2]] + np.array(volume.low) + 0.5)
+    room = centres @ T_room_grid[:3, :3].T + T_room_grid[:3, 3]
+    states = volume.voxels[tuple(index.T)]
+    assert (states == OCCUPIED).sum() > 3000 and (states == FREE).sum() > 20_000
+    for layer in np.unique(index[:, 2]):
+        at = room[index[:, 2] == layer]
+        height_m, found = float(at[0, 2]), states[index[:, 2] == layer]
+        assert is_solid(at[found == FREE, :2], height_m, height_m).mean() < 0.05 if (found == FREE).any() else True
+        near = is_solid(at[found == OCCUPIED, None, :2] + BESIDE, height_m - 0.07, height_m + 0.07).any(axis=1)
+        assert height_m < 0.07 or near.mean() > 0.9
 
 
 def test_depth_is_rendered_from_the_map() -> None:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import socket
+from itertools import pairwise
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from splatam_core.commands import view
 from splatam_core.errors import ViewerError
 from splatam_core.maps.viewer import scene
 from splatam_core.maps.viewer.packing import MOVED_M, ROW, SCALE, Chunks, pack
+from splatam_core.runs.record import RunDescription, Source
 from splatam_core.types import MapSnapshot
 
 
@@ -126,3 +132,68 @@ def test_an_address_that_cannot_be_used_is_refused_rather_than_waited_for(host: 
     pytest.importorskip('viser')
     with pytest.raises(ViewerError, match=f'the viewer cannot use {host}:{port}'):
         scene.open_server(host, port)
+
+
+@pytest.mark.parametrize(
+    ('host', 'said', 'opened'),
+    [
+        ('127.0.0.1', 'http://127.0.0.1:8080, for this machine only', 'http://127.0.0.1:8080'),
+        ('localhost', 'http://127.0.0.1:8080, for this machine only', 'http://127.0.0.1:8080'),
+        ('::1', 'http://[::1]:8080, for this machine only', 'http://[::1]:8080'),
+        ('0.0.0.0', 'http://0.0.0.0:8080, for everybody who reaches this machine', 'http://127.0.0.1:8080'),
+        ('', 'http://0.0.0.0:8080, for everybody who reaches this machine', 'http://127.0.0.1:8080'),
+        ('::', 'http://[::]:8080, for everybody who reaches this machine', 'http://[::1]:8080'),
+        ('10.1.2.3', 'http://10.1.2.3:8080, for everybody who reaches this machine', 'http://10.1.2.3:8080'),
+    ],
+)
+def test_the_address_says_for_whom_the_page_is(host: str, said: str, opened: str) -> None:
+    server = SimpleNamespace(get_host=lambda: host, get_port=lambda: 8080)
+    assert (scene.address(server), scene.page_url(server)) == (said, opened)
+
+
+def test_where_no_port_is_left_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """viser waits for ever behind port 65535."""
+    pytest.importorskip('viser')
+    with socket.socket() as other:
+        other.bind(('127.0.0.1', 0))
+        other.listen()
+        taken = other.getsockname()[1]
+        monkeypatch.setattr(scene, 'LAST_PORT', taken)
+        with pytest.raises(ViewerError, match=f'cannot use 127.0.0.1:{taken}: this port and those after it are taken'):
+            scene.open_server('127.0.0.1', taken)
+
+
+def test_a_long_path_is_thinned_out_evenly() -> None:
+    rng, path, points = np.random.default_rng(0), scene.CameraPath(most=40), np.zeros((1000, 3), np.float32)
+    points[:, 0] = np.arange(len(points))
+    ends = [0, *np.sort(rng.choice(np.arange(1, 1000), 150)).tolist()]
+    for begin, end in pairwise(ends):
+        path.extend(points[begin:end])
+        *kept, newest = path.points()[:, 0]
+        assert newest == end - 1 and len(kept) <= 40 and len({*np.diff(kept)}) <= 1
+        assert not kept or kept[0] == 0
+
+
+def test_a_frame_that_the_recording_lacks_is_rendered_from_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As when a bag was cut, or a disk with it was removed: the page goes on."""
+    rendered = np.zeros((24, 32, 3), np.uint8)
+    monkeypatch.setattr(view._Images, '_rendered', lambda self, T_world_cam: rendered)
+    description = RunDescription('splatam run', source=Source('synthetic', max_frames=2, width=32))
+    images = view._Images(SimpleNamespace(description=description), None)
+    assert images.at(1, np.eye(4)).any() and images.origin == 'recorded'
+    assert images.at(5, np.eye(4)) is not None and images.origin == (
+        'rendered from the map, because frame 6 of the recording cannot be read: it has 2 frames'
+    )
+    assert not images.at(1, np.eye(4)).any()
+
+
+def test_the_final_path_is_that_of_the_frames_that_are_shown() -> None:
+    """A run that was stopped between two lines has final poses of frames that are left out."""
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    run = SimpleNamespace(
+        trajectory=SimpleNamespace(stamps_ns=np.array([1, 2]), T_world_cam=poses[:2]),
+        poses=lambda: {stamp: pose + (stamp == 2) for stamp, pose in zip((1, 2, 3), poses)},
+    )
+    np.testing.assert_array_equal(view._corrected_path(run), [[0, 0, 0], [1, 1, 1]])
+    run.poses = lambda: dict(zip((1, 2, 3), poses))
+    assert view._corrected_path(run).shape == (0, 3)

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -20,9 +21,12 @@ from rclpy.logging import get_logger
 from splatam_core.cli import main
 from splatam_core.config import load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
+from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.maps.viewer.browser import FLAGS
 from splatam_core.slam import Slam
+from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status
 from splatam_ros.viewer.feed import ViewerFeed
+from splatam_ros.viewer.protocol import KINDS, MAX_MESSAGE, FrameUpdate, MapUpdate, SharedMemory, read, socket_pair
 
 FAST = ['threads=1', 'tracking.iterations=8', 'mapping.iterations=3']
 SIZE = {'width': 800, 'height': 500}
@@ -129,6 +133,76 @@ def test_the_page_shows_the_map_while_it_grows(
     finally:
         feed.close()
     assert not feed.is_asked
+
+
+class Listening:
+    """The viewer's end of a feed, without a page."""
+
+    def __init__(self) -> None:
+        self.warnings: list[str] = []
+        self.memories = {kind.code: SharedMemory() for kind in KINDS}
+        connection, self.socket = socket_pair()
+        self.feed = ViewerFeed(connection, self.memories, SimpleNamespace(warning=self.warnings.append))
+        self.slam, self._num = Slam(load_config('quick', FAST)), 0
+
+    def frame(self) -> None:
+        """One more frame, tracked at x = its number."""
+        pose, camera = np.eye(4), PinholeCamera(4, 4, 4.0, 4.0, 1.5, 1.5)
+        pose[0, 3], self._num = self._num, self._num + 1
+        frame = RgbdFrame(self._num, np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), np.float32), camera)
+        result = FrameResult(
+            index=self._num, stamp_ns=self._num, status=Status.TRACKED, T_world_cam=pose, is_keyframe=False, num_gaussians=0,
+            visible_fraction=1.0, inlier_fraction=1.0, reason='', timings=StageTimings(),
+        )  # fmt: skip
+        self.feed.take(frame, result, self.slam)
+
+    def asked(self, kind: type[FrameUpdate | MapUpdate]) -> Any:
+        """The answer to a request."""
+        self.socket.send(kind.code)
+        assert self.feed.is_asked
+        self.feed.answer(self.slam)
+        return read(self.socket.recv(MAX_MESSAGE), self.memories)
+
+
+def test_each_point_of_the_path_is_handed_over_once_and_none_of_an_earlier_map() -> None:
+    viewer = Listening()
+    viewer.frame()
+    assert viewer.asked(FrameUpdate).path[:, 0].tolist() == [0]
+    for _ in range(3):
+        viewer.frame()
+    assert viewer.asked(FrameUpdate).path[:, 0].tolist() == [1, 2, 3]
+    assert viewer.asked(FrameUpdate).path.shape == (0, 3)
+    assert viewer.asked(MapUpdate).means.shape == (0, 3)  # a map without Gaussians
+    viewer.frame()
+    viewer.feed.begin_map()
+    viewer.frame()
+    update = viewer.asked(FrameUpdate)
+    assert (update.epoch, update.path[:, 0].tolist()) == (1, [5])
+    viewer.feed.close()
+
+
+def test_the_end_of_the_viewer_is_one_warning_and_keeps_nothing_for_it() -> None:
+    viewer = Listening()
+    viewer.frame()
+    viewer.socket.close()
+    for _ in range(3):
+        viewer.frame()
+    assert viewer.warnings == ['the viewer has ended; the node goes on without']
+    assert not viewer.feed.is_asked and not viewer.feed._path
+    viewer.feed.close()
+
+
+def test_a_fault_of_the_viewer_costs_no_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    viewer = Listening()
+    monkeypatch.setattr(viewer.feed, '_map_update', lambda slam: 1 / 0)
+    viewer.frame()
+    viewer.socket.send(MapUpdate.code)
+    viewer.frame()
+    assert viewer.warnings == [
+        "the viewer is ended by an unexpected ZeroDivisionError('division by zero'); the node goes on without"
+    ]
+    assert viewer.socket.recv(MAX_MESSAGE) == b'' and not viewer.feed.is_asked
+    viewer.feed.close()
 
 
 @pytest.fixture(scope='module')

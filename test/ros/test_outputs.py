@@ -437,6 +437,8 @@ def test_foxglove_shows_what_the_node_publishes() -> None:
     scene = panels['3D!map']
     named = {*scene['topics'], *(panel['imageMode']['imageTopic'] for panel in panels.values() if 'imageMode' in panel)}
     assert named <= TOPICS.keys() and scene['followTf'] == MAP_FRAME
+    shown_in_space = {'PointCloud2', 'OccupancyGrid', 'Path', 'MarkerArray', 'PoseStamped'}
+    assert {topic.type_name.rpartition('/')[2] for topic in map(TOPICS.get, scene['topics'])} == shown_in_space
     cloud = scene['topics']['/splatam/map/points']
     # Foxglove's own choice for a little-endian field called rgb.
     assert (cloud['colorMode'], cloud['colorField'], cloud['rgbByteOrder']) == ('rgb', 'rgb', 'abgr')

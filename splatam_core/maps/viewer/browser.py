@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core.errors import ViewerError
+from splatam_core.maps.viewer.scene import page_url
 
 BROWSERS = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable')
 FLAGS = (
@@ -24,7 +25,7 @@ FLAGS = (
 )  # fmt: skip
 """Graphics in software. No sandbox: it does not work as root or in a container, and the only page is our own."""
 
-TIMEOUT_S = 120.0  # software graphics on busy cores are slow
+TIMEOUT_S = 300.0  # software graphics on busy cores are slow
 SETTLED, NUM_ALIKE = 0.5, 3  # mean difference of two pictures, of 255; the page fills in steps
 
 
@@ -71,7 +72,7 @@ def take_picture(server: Any, width: int, height: int) -> NDArray[np.uint8]:
         ViewerError: no browser is installed, or it shows nothing in time.
     """
     deadline_s = time.monotonic() + TIMEOUT_S
-    with open_page(f'http://127.0.0.1:{server.get_port()}', width, height + 100):
+    with open_page(page_url(server), width, height + 100):
         alike: list[NDArray[np.uint8]] = []  # the newest pictures, all the same
         while time.monotonic() < deadline_s:
             time.sleep(0.2)

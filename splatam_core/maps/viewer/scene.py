@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import ipaddress
 import logging
 import socket
 from importlib.util import find_spec
@@ -21,6 +22,8 @@ Matrix = NDArray[np.float64]
 FRUSTUM_M = 0.15
 LINE_PX = 2.5
 MAX_LINE_POINTS = 4000
+MAX_PORTS, LAST_PORT = 1000, 65535  # that are tried
+ANY, ANY_V6 = '0.0.0.0', '::'  # every address of the machine
 CAMERA_COLOR = (230, 230, 230)
 BACK_M, ABOVE_M, AHEAD_M = 0.9, 0.35, 2.0
 """From where a camera is watched: behind and above it, towards a point ahead of it."""
@@ -43,7 +46,7 @@ def open_server(host: str, port: int) -> Any:
         ViewerError: viser is missing, or the address cannot be used.
     """
     check_viser()
-    _check_address(host, port)
+    port = _free_port(host, port)
     import rich
     import viser
 
@@ -59,20 +62,28 @@ def open_server(host: str, port: int) -> Any:
     return server
 
 
-def _check_address(host: str, port: int) -> None:
-    """Checks that the address can be listened on: viser would wait for ever.
+def _free_port(host: str, port: int) -> int:
+    """Returns the first port from this one that can be listened on: where there is none, viser would wait for ever.
 
     Raises:
-        ViewerError: it cannot be.
+        ViewerError: the address cannot be listened on, or each of these ports is taken.
     """
+    where = f'{host}:{port}'
     try:
-        family, kind, *_, where = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        with socket.socket(family, kind) as probe:
-            probe.bind((where[0], port, *where[2:]))
-    except (OSError, OverflowError, UnicodeError) as error:
-        if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
-            return
-        raise ViewerError(f'the viewer cannot use {host}:{port}: {error}') from None
+        family, kind, *_, name = socket.getaddrinfo(host or None, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        for number in range(port, min(port + MAX_PORTS, LAST_PORT) + 1):
+            with socket.socket(family, kind) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as viser does: a page that was open just now
+                try:
+                    probe.bind((name[0], number, *name[2:]))
+                    probe.listen()
+                    return number
+                except OSError as error:
+                    if error.errno != errno.EADDRINUSE:
+                        raise
+    except (OSError, UnicodeError) as error:
+        raise ViewerError(f'the viewer cannot use {where}: {error}') from None
+    raise ViewerError(f'the viewer cannot use {where}: this port and those after it are taken, or do not exist')
 
 
 def _refuse_to_share(*_: object, **__: object) -> None:
@@ -81,10 +92,56 @@ def _refuse_to_share(*_: object, **__: object) -> None:
 
 def address(server: Any) -> str:
     """Return where the page is, and for whom."""
-    host, port = server.get_host(), server.get_port()
-    if host in ('127.0.0.1', 'localhost', '::1'):
-        return f'http://127.0.0.1:{port}, for this machine only'
-    return f'http://{host}:{port}, for everybody who reaches this machine'
+    host = server.get_host()
+    if _is_of_this_machine(host):
+        return f'{page_url(server)}, for this machine only'
+    return f'http://{_in_url(host or ANY)}:{server.get_port()}, for everybody who reaches this machine'
+
+
+def page_url(server: Any) -> str:
+    """Return the page's URL for a browser on this machine."""
+    host = {'': '127.0.0.1', ANY: '127.0.0.1', ANY_V6: '::1', 'localhost': '127.0.0.1'}.get(server.get_host(), server.get_host())
+    return f'http://{_in_url(host)}:{server.get_port()}'
+
+
+def _in_url(host: str) -> str:
+    return f'[{host}]' if ':' in host else host
+
+
+def _is_of_this_machine(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == 'localhost'
+
+
+class CameraPath:
+    """Positions of a camera, thinned out evenly as they become many."""
+
+    def __init__(self, most: int = 2 * MAX_LINE_POINTS) -> None:
+        """Begin with none.
+
+        Args:
+            most: largest number of positions to keep.
+        """
+        self._most, self._stride, self._count = most, 1, 0
+        self._kept: list[NDArray[np.float32]] = []
+        self._newest = np.zeros((0, 3), np.float32)
+
+    def extend(self, points: NDArray[np.float32]) -> None:
+        """Add positions [N, 3]."""
+        if not len(points):
+            return
+        self._kept += list(points[-self._count % self._stride :: self._stride])
+        self._count, self._newest = self._count + len(points), points[-1:]
+        while len(self._kept) > self._most:
+            del self._kept[1::2]
+            self._stride *= 2
+
+    def points(self) -> NDArray[np.float32]:
+        """Return the positions [N, 3], the first and the newest of all among them."""
+        is_kept = (self._count - 1) % self._stride == 0
+        return np.array([*self._kept, *self._newest[is_kept:]], np.float32).reshape(-1, 3)
 
 
 class Scene:
