@@ -2,21 +2,24 @@
 
     python benchmarks/consistency.py [RECORDING ...] [--preset realtime] [--width 320] [--runs 1] [--data DIR] [--set KEY=VALUE]
 
-RECORDING is a folder in DIR, FOLDER:START:END for some of its frames, or ``corridor:N`` for N synthetic frames along the wall of
-growth.py and N back. Run k has seed k and one thread. A loop is false if it differs from the ground truth by more than 8 cm.
-`graph` is the mean time per frame in the graph, as a share of the whole; `slowest` the longest of a keyframe.
+RECORDING is a folder in DIR, FOLDER:START:END for some of its frames, ``corridor:N`` for N synthetic frames along the wall of
+growth.py and N back, or ``ring:N`` for once around the ring of ring.py in N frames and a tenth of it again. Run k has seed k and
+one thread. A loop is false if it differs from the ground truth by more than 8 cm. `graph` is the time in the graph, as a share of
+the whole; `slowest` the longest of a frame. `PSNR` is that of the final map at the final poses, every 10th frame; `again` that of
+the frames that see a synthetic place for the second time.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import growth
 import numpy as np
-from growth import camera, frame_at, pose
+import ring
 from header import print_header
 from numpy.typing import NDArray
 
@@ -28,40 +31,62 @@ from splatam_core.geometry.trajectory import Trajectory, interpolate_poses
 from splatam_core.slam import Slam
 from splatam_core.types import FrameResult, RgbdFrame, Status
 
-RECORDINGS = ('redkitchen_320:0:1000', 'redkitchen_320:300:600', 'fr1_rpy_320:0:430', 'corridor:500')
+RECORDINGS = ('redkitchen_320:0:1000', 'redkitchen_320:300:600', 'fr1_rpy_320:0:430', 'd435_desk', 'corridor:500', 'ring:500')
 COLUMNS = (
     'recording', 'seed', 'frames', 'uncertain', 'lost', 'ATE cm online', 'final', 'end cm online', 'final', 'loops', 'false',
-    'corrections', 'ms per frame', 'graph %', 'slowest ms', 'Gaussians',
+    'corrections', 'ms per frame', 'graph %', 'slowest ms', 'Gaussians', 'PSNR dB', 'again',
 )  # fmt: skip
 FALSE_M = 0.08
 
 
+SCORED_EVERY = 10
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """Frames and their true poses."""
+    """Frames and their true poses.
+
+    Attributes:
+        length: number of frames.
+        frame: returns the frame of a number.
+        ground_truth: the true poses.
+        again_from: number of the first frame that sees a place again; the length where that is not known.
+    """
 
     length: int
-    frames: Iterator[RgbdFrame]
+    frame: Callable[[int], RgbdFrame]
     ground_truth: Trajectory
+    again_from: int
 
 
 def opened(name: str, args: argparse.Namespace) -> Recording:
-    """Opens a recording, or makes the corridor."""
+    """Opens a recording, or makes a synthetic one."""
     folder, *limits = name.split(':')
-    if folder == 'corridor':
-        there = int(limits[0])
-        places = [*range(there), *reversed(range(there))]
-        cam, rng = camera(args.width), np.random.default_rng(0)
-        stamps_ns = 10**9 + np.arange(len(places)) * 33_333_333
-        frames = (frame_at(pose(place), int(stamp_ns), cam, rng) for place, stamp_ns in zip(places, stamps_ns))
-        return Recording(len(places), frames, Trajectory(stamps_ns, np.array([pose(place) for place in places])))
+    if folder in ('corridor', 'ring'):
+        return synthetic(folder, int(limits[0]), args.width)
     start, end = (int(limits[0]), int(limits[1])) if limits else (0, None)
     max_frames = None if end is None else end - start
     sequence = open_sequence(str(args.data / folder), width=args.width, start=start, max_frames=max_frames)
     ground_truth = sequence.ground_truth()
     if ground_truth is None:
         raise SystemExit(f'{name} has no ground truth')
-    return Recording(len(sequence), (sequence[index] for index in range(len(sequence))), ground_truth)
+    return Recording(len(sequence), sequence.__getitem__, ground_truth, len(sequence))
+
+
+def synthetic(kind: str, count: int, width: int) -> Recording:
+    """Makes the corridor, there and back, or the ring. Each frame has noise of its own, the same every time."""
+    cam = growth.camera(width)
+    if kind == 'corridor':
+        poses, again_from = [growth.pose(place) for place in (*range(count), *reversed(range(count)))], count
+    else:
+        poses, again_from = [ring.pose(place, count) for place in range(count + count // 10)], count
+    stamps_ns = 10**9 + np.arange(len(poses)) * 33_333_333
+
+    def frame(index: int) -> RgbdFrame:
+        T, stamp_ns, rng = poses[index], int(stamps_ns[index]), np.random.default_rng(index)
+        return growth.frame_at(T, stamp_ns, cam, rng) if kind == 'corridor' else ring.frame_at(T, stamp_ns, count, cam, rng)
+
+    return Recording(len(poses), frame, Trajectory(stamps_ns, np.array(poses)), again_from)
 
 
 def row(name: str, seed: int, args: argparse.Namespace) -> str:
@@ -70,9 +95,9 @@ def row(name: str, seed: int, args: argparse.Namespace) -> str:
     apply_threads(config)
     recording = opened(name, args)
     slam = Slam(config, num_frames=recording.length)
-    results = [slam.process(frame) for frame in recording.frames]
+    results = [slam.process(recording.frame(index)) for index in range(recording.length)]
     online = poses(results)
-    slam.optimize_graph()
+    slam.finish()
     final = Trajectory(online.stamps_ns, slam.graph.corrected(online.stamps_ns, online.T_world_cam))
     loops = loop_errors_m(slam, recording.ground_truth)
     total, graph = (np.array([getattr(result.timings, stage) for result in results]) for stage in ('total', 'graph'))
@@ -82,7 +107,7 @@ def row(name: str, seed: int, args: argparse.Namespace) -> str:
         name, seed, len(results), *(sum(r.status is status for r in results) for status in (Status.UNCERTAIN, Status.LOST)),
         *(f'{100 * error.rmse_m:.2f}' for error in errors), *(f'{100 * end:.1f}' for end in ends), len(loops),
         int((loops > FALSE_M).sum()), slam.graph.num_corrections, f'{total.mean():.1f}', f'{100 * graph.sum() / total.sum():.1f}',
-        f'{graph.max():.0f}', slam.num_gaussians,
+        f'{graph.max():.0f}', slam.num_gaussians, *psnr_db(slam, recording, final),
     ]  # fmt: skip
     return '| ' + ' | '.join(map(str, cells)) + ' |'
 
@@ -91,6 +116,18 @@ def poses(results: list[FrameResult]) -> Trajectory:
     """Returns the poses of the frames that have one."""
     posed = [(result.stamp_ns, result.T_world_cam) for result in results if result.T_world_cam is not None]
     return Trajectory(np.array([stamp_ns for stamp_ns, _ in posed]), np.array([T for _, T in posed]))
+
+
+def psnr_db(slam: Slam, recording: Recording, final: Trajectory) -> list[str]:
+    """Returns the mean PSNR of some frames, and of those that see a place again."""
+    posed, scores = dict(zip(final.stamps_ns.tolist(), final.T_world_cam)), {}
+    for index in range(0, recording.length, SCORED_EVERY):
+        frame = recording.frame(index)
+        if frame.stamp_ns in posed:
+            rendered, seen = slam.render(posed[frame.stamp_ns]).rgb.astype(np.float64), frame.depth_m > 0
+            scores[index] = -10 * np.log10(np.mean(np.square((rendered - frame.rgb)[seen] / 255)))
+    parts = list(scores.values()), [score for index, score in scores.items() if index >= recording.again_from]
+    return [f'{np.mean(part):.2f}' if part else '' for part in parts]
 
 
 def end_error_m(estimate: Trajectory, ground_truth: Trajectory) -> float:

@@ -56,11 +56,16 @@ def frame(index: int, cam: PinholeCamera, rng: np.random.Generator) -> RgbdFrame
     return frame_at(pose(index), 10**9 + index * 33_333_333, cam, rng)
 
 
+def rays_of(T: NDArray[np.float64], cam: PinholeCamera) -> NDArray[np.float64]:
+    """Returns [H, W, 3] the directions in the world of the pixels of a camera at a pose [4, 4], one metre deep."""
+    u, v = np.meshgrid(np.arange(cam.width), np.arange(cam.height))
+    return np.stack([(u - cam.cx) / cam.fx, (v - cam.cy) / cam.fy, np.ones(u.shape)], -1) @ T[:3, :3].T
+
+
 def frame_at(T: NDArray[np.float64], stamp_ns: int, cam: PinholeCamera, rng: np.random.Generator) -> RgbdFrame:
     """Renders the view of a camera at a pose [4, 4]."""
-    u, v = np.meshgrid(np.arange(cam.width), np.arange(cam.height))
-    rays = np.stack([(u - cam.cx) / cam.fx, (v - cam.cy) / cam.fy, np.ones(u.shape)], -1) @ T[:3, :3].T
-    depth, colour = np.full(u.shape, np.inf), np.zeros((*u.shape, 3))
+    rays = rays_of(T, cam)
+    depth, colour = np.full(rays.shape[:2], np.inf), np.zeros(rays.shape)
     for axis, offset in SIDES:
         with np.errstate(divide='ignore', invalid='ignore'):
             z = (offset - T[axis, 3]) / rays[..., axis]
@@ -73,10 +78,17 @@ def frame_at(T: NDArray[np.float64], stamp_ns: int, cam: PinholeCamera, rng: np.
         points = T[:3, 3] + np.where(nearer, z, 1.0)[..., None] * rays
         colour[nearer] = texture(points[..., 2], points[..., 1 - axis] + 3.0 * axis + offset)[nearer]
         depth[nearer] = z[nearer]
-    depth[depth > 6.0] = 0.0
+    return noisy(stamp_ns, colour, depth, cam, rng)
+
+
+def noisy(
+    stamp_ns: int, colour: NDArray[np.float64], depth: NDArray[np.float64], cam: PinholeCamera, rng: np.random.Generator
+) -> RgbdFrame:
+    """Returns colours [H, W, 3] from 0 to 1 and depths [H, W] as a camera would see them."""
+    depth = np.where(depth > 6.0, 0.0, depth)
     depth += 0.0015 * depth**2 * rng.standard_normal(depth.shape)
-    noisy = 255 * np.clip(colour, 0, 1) + rng.normal(0, 2, colour.shape)
-    rgb = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+    values = 255 * np.clip(colour, 0, 1) + rng.normal(0, 2, colour.shape)
+    rgb = np.clip(np.rint(values), 0, 255).astype(np.uint8)
     return RgbdFrame(stamp_ns, rgb, np.maximum(depth, 0).astype(np.float32), cam)
 
 

@@ -8,7 +8,20 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from splatam_core.commands import ablations, bench, compare, convert, evaluate, export, lpips_weights, refine, render, run, view
+from splatam_core.commands import (
+    ablations,
+    bench,
+    compare,
+    convert,
+    evaluate,
+    export,
+    lpips_weights,
+    merge,
+    refine,
+    render,
+    run,
+    view,
+)
 from splatam_core.commands.shared import EXIT_ERROR, EXIT_INTERRUPTED
 from splatam_core.errors import SplatamError, one_line
 from splatam_core.interruption import on_stop_signals
@@ -22,6 +35,7 @@ COMMANDS = (
     compare.COMMAND,
     render.COMMAND,
     refine.COMMAND,
+    merge.COMMAND,
     export.COMMAND,
     view.COMMAND,
     bench.COMMAND,

@@ -93,6 +93,18 @@ class RelocalisationConfig:
         'per frame while the camera is lost.',
         minimum=1, maximum=100,
     )  # fmt: skip
+    on_lost: str = setting(
+        'wait',
+        'What happens when the camera stays lost: wait = until it sees a place that it knows; new_map = it starts a new map of the '
+        'place it sees, and joins it to the old one when a place of both is recognised. Needs graph.enabled.',
+        choices=('wait', 'new_map'),
+    )
+    new_map_after: int = setting(
+        90,
+        'A new map starts when the camera was lost for this many frames (on_lost = new_map). Increase when it is often lost for a '
+        'while in places that it knows.',
+        unit='frames', minimum=1, maximum=MAX_FRAMES,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -587,6 +599,11 @@ def _check_combinations(config: SlamConfig) -> None:
         raise ConfigError(f'width = {config.width}: expected 0 (as recorded) or at least 16 (px)')
     if not config.depth.min_m < config.depth.max_m:
         raise ConfigError(f'depth.min_m = {config.depth.min_m:g}: expected less than depth.max_m = {config.depth.max_m:g}')
+    if config.tracking.align.relocalisation.on_lost == 'new_map' and not (config.graph.enabled and config.tracking.relocalises):
+        raise ConfigError(
+            'tracking.align.relocalisation.on_lost = new_map: maps are joined by the keyframe graph; set graph.enabled=true and '
+            'tracking.align.relocalisation.enabled=true, or on_lost=wait'
+        )
     if config.device == 'cuda' and config.rasterizer == 'cpu':
         raise ConfigError('rasterizer = cpu: runs on the CPU, but device = cuda; set rasterizer=auto, or device=cpu')
     if config.mapping.hold_out == 1:

@@ -47,6 +47,10 @@ class ExportError(SplatamError):
     """A map that cannot be brought into the form asked for."""
 
 
+class MergeError(SplatamError):
+    """Two maps that cannot be joined."""
+
+
 class ViewerError(SplatamError):
     """A viewer that cannot be shown: a package or a browser is missing."""
 

@@ -18,7 +18,7 @@ from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.graph.corrections import Corrections
 from splatam_core.graph.keyframe_graph import KeyframeGraph, TrackedFrame
-from splatam_core.graph.places import Places
+from splatam_core.graph.places import Places, shows_a_place
 from splatam_core.graph.relocalisation import Relocaliser, RelocaliserState, Sight
 from splatam_core.images.observation import Observation
 from splatam_core.images.spacing import describe_spacing
@@ -27,7 +27,7 @@ from splatam_core.interruption import Stop, never
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.mapper import Mapper
 from splatam_core.mapping.optimizers.base import TimeLimit
-from splatam_core.mapping.posed import PosedView
+from splatam_core.mapping.posed import PosedFrame, PosedView
 from splatam_core.rasterizer import Gaussians, make_rasterizer
 from splatam_core.state import NO_KEYFRAMES, SavedKeyframes, SlamState
 from splatam_core.stopwatch import Stopwatch
@@ -40,6 +40,8 @@ from splatam_core.types import FrameResult, MapSnapshot, RenderedView, RgbdFrame
 
 Matrix = NDArray[np.float64]
 _log = logging.getLogger(__name__)
+
+_APART_M = 30.0  # from an old map to a new one: more than any camera sees
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,11 +191,12 @@ class SlamLifecycle:
             mapper.keyframes.append(keyframe)
         self.reset()
         self._mapper = mapper
+        self.graph.load(self.keyframes)
         self._motion.place(np.eye(4) if T_world_cam is None else T_world_cam)
         self._relocaliser.state = RelocaliserState(is_anywhere=T_world_cam is None)
         if self._knows_places:
             self.places.restore(saved.places)
-            self.places.follow(saved.keyframes)
+            self.places.follow(self._mapper.keyframes)  # those within the budget
 
     def suggest(self, T_world_cam: Matrix) -> None:
         """Tries a pose [4, 4] that a person gave, on the next frame; the log says if the camera is not there."""
@@ -308,14 +311,47 @@ class SlamLifecycle:
             return None
         return TrackedFrame(self._num_frames - 1, self._last_stamp_ns, self._motion.trusted_pose, np.zeros((6, 6)))
 
+    def _lose(self, current: CurrentFrame, verdict: Verdict, tracked: TrackingResult) -> FrameResult:
+        """Returns the result of a lost frame."""
+        self._motion.stop()
+        return current.result(verdict, None, self, tracking=tracked)
+
+    def _begin_elsewhere(self, current: CurrentFrame, seen: Observation) -> FrameResult | None:
+        """Starts a new map where the camera is, if it was lost for long and sees enough. Returns None if it does not.
+
+        The new map lies beside the old one, far enough that neither sees the other, until a place of both is recognised.
+        """
+        config = self.config.tracking.align.relocalisation
+        is_due = config.on_lost == 'new_map' and self._relocaliser.state.num_in_doubt >= config.new_map_after
+        if not is_due or self.config.tracking.method == 'truth' or not self.graph.is_used or not len(self.graph.nodes):
+            return None
+        if not (self._mapper.schedule.plan(current.index, 0.0).is_used and shows_a_place(seen.host)):
+            return None
+        T_world_cam = self._motion.trusted_pose.copy()
+        self.graph.interrupt(TrackedFrame(current.index - 1, current.frame.stamp_ns - 1, T_world_cam, np.zeros((6, 6))))
+        T_world_cam[0, 3] = float(self.map.means.detach()[:, 0].max()) + _APART_M
+        posed = PosedFrame(seen, se3.inverse(T_world_cam), self.config.mapping, current.index)
+        plan = self._mapper.schedule.plan(0, visible_fraction=0.0)
+        self._mapper.densify(posed, plan)
+        self._mapper.optimize(self._mapper.select(posed, plan), plan)
+        current.clock.lap('map')
+        self._motion.place(T_world_cam)
+        self._motion.observe(current.frame.stamp_ns, T_world_cam)
+        self._relocaliser.state, self._last_seen = RelocaliserState(), seen
+        self._note_place(seen, current.index)
+        self._follow_graph(current, T_world_cam, begins=True)
+        _log.warning('frame %d: the camera is in a place that the map does not show: a new map starts beside it', current.index)
+        return current.result(self._judge.start(), T_world_cam, self, is_keyframe=True)
+
     def _follow_graph(
-        self, current: CurrentFrame, T_world_cam: Matrix, evidence: Evidence | None = None, *, is_found: bool = False
-    ) -> None:
+        self, current: CurrentFrame, T_world_cam: Matrix, evidence: Evidence | None = None, found_at: int | None = None, *,
+        begins: bool = False,
+    ) -> None:  # fmt: skip
         """Tells the graph of a tracked frame; corrects map, keyframes and the poses from which tracking goes on, if it says so."""
         if not self.graph.is_used or not len(self._mapper.keyframes):
             return
         covariance = np.zeros((6, 6)) if evidence is None else evidence.covariance
-        frame = TrackedFrame(current.index, current.frame.stamp_ns, T_world_cam, covariance, is_found)
+        frame = TrackedFrame(current.index, current.frame.stamp_ns, T_world_cam, covariance, found_at, begins)
         try:
             self._correct(self.graph.follow(frame, self._mapper.keyframes, self.places))
         except np.linalg.LinAlgError as error:  # the frame is tracked and mapped: only its edges are missing

@@ -57,8 +57,7 @@ class Slam(SlamLifecycle):
             self._motion.place(found.T_world_cam)
         current.clock.lap('track')
         if verdict.status is Status.LOST:
-            self._motion.stop()
-            return current.result(verdict, None, self, tracking=tracked)
+            return self._begin_elsewhere(current, seen) or self._lose(current, verdict, tracked)
 
         # Depth sets the pace: colour that comes late, or twice, says little about how the camera moves.
         T_world_cam_depth, T_world_cam = se3.inverse(tracked.T_cam_world_depth), se3.inverse(tracked.T_cam_world)
@@ -80,7 +79,7 @@ class Slam(SlamLifecycle):
         current.clock.lap('map')
         if plan.is_keyframe or verdict.corrects:
             self._note_place(seen, current.index)
-        self._follow_graph(current, T_world_cam, tracked.evidence, is_found=found is not None)
+        self._follow_graph(current, T_world_cam, tracked.evidence, None if found is None else found.keyframe)
         current.clock.lap('graph')
         return current.result(
             verdict, T_world_cam, self, tracking=tracked, is_keyframe=plan.is_keyframe, is_relocalised=found is not None

@@ -3,17 +3,17 @@
 An edge of the odometry joins two keyframes as they were tracked in one and the same state of the map: the earlier one after
 what was corrected when it was added, the later one before anything is. So a correction never enters a measurement.
 
-The work of a keyframe is divided among it and the two frames after it, so that no frame takes long: places near the camera are
-looked for at once, others with the first of these frames, and poses are optimised with the second. That frame becomes a node,
-too, for as long as it takes to correct the map at it.
+The work of a keyframe waits in a queue, from which each frame takes a bounded part, and poses are optimised a few steps a frame.
+So no frame takes long, and the same frames do the same work. The frame at which the optimisation ends becomes a node, too, for as
+long as it takes to correct the map at it.
 """
 
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -23,10 +23,24 @@ from splatam_core.config import SlamConfig
 from splatam_core.geometry import motions, se3
 from splatam_core.geometry.se3 import Matrix
 from splatam_core.graph.corrections import Corrections
+from splatam_core.graph.links import (
+    COST,
+    Kind,
+    Link,
+    Task,
+    Work,
+    brought_together,
+    contradiction,
+    deviations,
+    inverse,
+    parts,
+    renumbered,
+    size,
+)
 from splatam_core.graph.nodes import Nodes
 from splatam_core.graph.pairs import PairAligner, PairResult
 from splatam_core.graph.places import Places
-from splatam_core.graph.pose_graph import Edge, PoseGraph, Solution, optimize
+from splatam_core.graph.pose_graph import Optimizer, OptimizerState, PoseGraph
 from splatam_core.mapping.keyframes import overlaps, sample_points
 from splatam_core.mapping.posed import PosedView
 from splatam_core.tracking.aligner import Aligner
@@ -37,59 +51,25 @@ _log = logging.getLogger(__name__)
 WINDOW = 1, 2
 """A keyframe is aligned directly to those so many before it: farther apart the odometry is better."""
 
-_LIMIT = 60.0  # of the squared error of an edge, in standard deviations of six numbers
-_LEAST_WEIGHT = 0.3  # that the others leave a loop
+_MOST_WRONG = 4.0  # deviations of a loop, by which the optimised graph contradicts it at most: 8 cm
+_LEAST_DRIFT = 0.5  # of the squared disagreement of loops, in position, that a correction takes away
 _MAX_BACK = 0.02, 0.015  # m, rad: there and back
 _LEAST_OVERLAP, _LEAST_AGREEMENT = 0.3, 0.9
 _MAX_SURPRISE = 0.05  # m and rad: a pair in the window that is farther from the odometry is wrong
 _CANDIDATES = 2  # places compared per keyframe
 _LOOK_EVERYWHERE = 2  # keyframes from one search by features to the next, where no place is found near the camera
 _LEAST_EXPLAINED = 0.6  # of the view, by a loop
-_LARGE = 0.15  # m and rad: a correction by more needs two loops
-_SAME = 0.1  # m and rad: loops that correct alike
+_SAME = 0.03, 0.1  # m and rad: loops that correct alike differ by less than half of the correction, within these limits
 _GAP_TO_FOUND = 10.0  # keyframes: to a place that was recognised the map says how it lies, with all drift since it was seen
 _SAMPLES = 200
 _MARGIN = 0.03  # of the width
+_WORK_PER_KEYFRAME = 10  # alignments: a little more than a keyframe needs
+_MOST_TASKS = 40  # beyond it, places are not looked for by features
+_STEPS_PER_FRAME = 2  # of the optimisation
 
-
+_NO_POSES = np.empty((0, 4, 4))
 _LINK_ARRAYS = 'T_first_second', 'information', 'limits', 'kinds'
-_SINGLE_ARRAYS = 'T_world_odom', 'num_corrections', 'look_at', 'last_correction_m', 'is_interrupted'
-
-
-class Kind(IntEnum):
-    """What an edge was measured by."""
-
-    ODOMETRY = 0
-    WINDOW = 1
-    LOOP = 2
-    PENDING = 3  # a loop that no other one confirms yet
-    FOUND = 4  # a loop that nobody has compared with the graph yet
-
-
-_DEVIATIONS = {Kind.ODOMETRY: (0.008, 0.004), Kind.WINDOW: (0.005, 0.003), Kind.LOOP: (0.012, 0.008)}
-"""Errors (m, rad) that images do not show, such as those of calibration; from one keyframe to the next, or of a loop."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Link(Edge):
-    """An edge, and what it was measured by."""
-
-    kind: Kind = Kind.ODOMETRY
-
-    @classmethod
-    def measured(cls, first: int, second: int, T: Matrix, kind: Kind, covariance: Matrix, factor: float = 1.0) -> Link:
-        """Returns a link between two nodes.
-
-        Args:
-            first: number of a node.
-            second: of another one.
-            T: [4, 4] the motion between them.
-            kind: what it was measured by, which has errors of its own.
-            covariance: [6, 6] of the motion as the images say.
-            factor: by which the errors of its kind are larger than usual.
-        """
-        own = np.diag(np.repeat(np.square(factor * np.array(_DEVIATIONS[kind])), 3))
-        return cls(first, second, T, _inverse(own + covariance), np.inf if kind is Kind.ODOMETRY else _LIMIT, kind=kind)
+_SINGLE_ARRAYS = 'T_world_odom', 'num_corrections', 'last_correction_m', 'is_interrupted', 'solving', 'solving_widths'
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,14 +81,34 @@ class TrackedFrame:
         stamp_ns: its stamp.
         T_world_cam: [4, 4] as it was tracked.
         covariance: [6, 6] of that, as a twist in the camera's axes; zeros where it is not known.
-        is_found: True if the camera was lost before and has been found anew, so that the way to here is not known.
+        found_at: number of the keyframe by which a camera that was lost has been found anew, so that the way to here is not known;
+            negative if it is no node; None = it was not lost.
+        begins: True if a new map begins here, of which nobody knows how it lies to the old one.
     """
 
     index: int
     stamp_ns: int
     T_world_cam: Matrix
     covariance: Matrix
-    is_found: bool = False
+    found_at: int | None = None
+    begins: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solving:
+    """An optimisation that goes on.
+
+    Attributes:
+        optimizer: takes the steps.
+        num_nodes: number of active nodes that take part: the first ones.
+        num_links: number of links of which those that are sure take part: the first ones.
+        is_second: True after loops that contradict the others were left out.
+    """
+
+    optimizer: Optimizer
+    num_nodes: int
+    num_links: int
+    is_second: bool = False
 
 
 class KeyframeGraph:
@@ -123,7 +123,8 @@ class KeyframeGraph:
     nodes: Nodes
     _active: list[int]  # numbers of the nodes that edges connect
     _links: list[Link]
-    _look_at: int | None  # node to be looked for anywhere with the next frame
+    _tasks: list[Task]  # what is still to be measured
+    _solving: _Solving | None  # the optimisation that goes on
     _is_interrupted: bool  # frames were left out before the next one
 
     def __init__(self, config: SlamConfig, aligner: Aligner[Any] | None) -> None:
@@ -142,6 +143,7 @@ class KeyframeGraph:
     def configure(self, config: SlamConfig) -> None:
         """Uses other settings from the next keyframe on."""
         self._config, self._seed, self._every = config.graph, config.seed, config.keyframes.every
+        self._work_per_frame = -(-_WORK_PER_KEYFRAME // self._every)
         self._pairs = PairAligner(self._aligner, config.tracking) if self._aligner is not None else None
 
     @property
@@ -169,6 +171,18 @@ class KeyframeGraph:
         pairs = [(link.first, link.second) for link in self._links if link.kind in kinds]
         return np.array(pairs, dtype=np.intp).reshape(-1, 2)
 
+    def load(self, keyframes: Sequence[PosedView]) -> None:
+        """Begins with the keyframes of a map that was loaded, which stay where they are: loops to them correct what comes.
+
+        Args:
+            keyframes: with negative numbers, increasing.
+        """
+        self.rest()
+        for keyframe in keyframes if self.is_used else ():
+            T_world_cam = se3.inverse(keyframe.T_cam_world.double().numpy(force=True))
+            self._active.append(len(self.nodes))
+            self.nodes = self.nodes.added(keyframe.frame, keyframe.frame, T_world_cam)
+
     def follow(self, frame: TrackedFrame, keyframes: Sequence[PosedView], places: Places | None = None) -> Corrections | None:
         """Goes on with the work after a tracked frame, which may be a new keyframe.
 
@@ -182,39 +196,37 @@ class KeyframeGraph:
         """
         by_frame = {keyframe.frame: keyframe for keyframe in keyframes}
         if frame.index in by_frame:
-            self._look_at = None
             self._add(frame)
-            self._take_out_dropped(by_frame)
-            self._join_window(len(self.nodes) - 1, by_frame)
-            self._find_nearby(len(self.nodes) - 1, by_frame)
-        elif frame.is_found or self._is_interrupted:
+            if self._solving is None:
+                self._take_out_dropped(by_frame)
+            self._plan(len(self.nodes) - 1, by_frame)
+        elif frame.found_at is not None or self._is_interrupted:
             self._add(frame)
-        elif self._look_at is not None and places is not None:
-            node, self._look_at = self._look_at, None
-            self._find_anywhere(node, by_frame, places)
-        elif found := [link for link in self._links if link.kind is Kind.FOUND]:
-            self._links = [link for link in self._links if link.kind is not Kind.FOUND]
-            return self._close(found, frame)
-        return None
+        self._measure(by_frame, places)
+        return self._solve(frame)
 
     def _add(self, frame: TrackedFrame) -> None:
         """Adds a node, and joins it to the one before."""
         if len(self.nodes) and frame.stamp_ns <= self.nodes.stamps_ns[-1]:
             self.rest()
-        is_far = frame.is_found or self._is_interrupted
-        node, self._is_interrupted = len(self.nodes), False
+        is_far, node = frame.found_at is not None or self._is_interrupted, len(self.nodes)
+        self._is_interrupted = False
         self.nodes = self.nodes.added(frame.index, frame.stamp_ns, frame.T_world_cam)
         self._active.append(node)
-        if not node:
+        if not node or frame.begins or self.nodes.frames[node - 1] < 0:
             return
-        step = motions.between(self.nodes.placed[node - 1], frame.T_world_cam)
-        gap = (frame.index - int(self.nodes.frames[node - 1])) / self._every
-        gap = max(gap, _GAP_TO_FOUND) if is_far else gap
-        self._links.append(Link.measured(node - 1, node, step, Kind.ODOMETRY, frame.covariance, gap))
+        before, T_before = node - 1, self.nodes.placed[node - 1]
+        gap = (frame.index - int(self.nodes.frames[before])) / self._every
+        at = [n for n in self._active[:-1] if frame.found_at is not None and self.nodes.frames[n] == frame.found_at]
+        if at:
+            before, T_before = at[0], self.nodes.T_world_cam[at[0]]
+        step, gap = motions.between(T_before, frame.T_world_cam), max(gap, _GAP_TO_FOUND) if is_far else gap
+        self._links.append(Link.measured(before, node, step, Kind.ODOMETRY, frame.covariance, gap))
 
     def _take_out_dropped(self, by_frame: dict[int, PosedView]) -> None:
-        """Takes out the nodes that have no images, but neither the first nor the last."""
-        for node in [node for node in self._active[1:-1] if int(self.nodes.frames[node]) not in by_frame]:
+        """Takes out the nodes that have no images. The first and the last of each map stay: what is beside them moves with them."""
+        ways = Counter(node for link in self._links if link.kind is Kind.ODOMETRY for node in (link.first, link.second))
+        for node in [node for node in self._active[1:-1] if int(self.nodes.frames[node]) not in by_frame and ways[node] > 1]:
             self._merge(node)
 
     def settle(self, newest: TrackedFrame | None) -> Corrections | None:
@@ -225,74 +237,103 @@ class KeyframeGraph:
         Args:
             newest: the last frame, at which map and poses are corrected; it becomes a node. None = the last node.
         """
+        self._solving = None
+        self._accept()
         if not self.num_loops:
             return None
         self._extend(newest)
-        return self._corrections(self._optimized(self._sure()))
+        self._begin_solving()
+        while (solution := self._solved()) is None:
+            pass
+        is_worth_it = self.num_loops and self._is_drift(self._active, solution)
+        return self._corrections(solution, self._active) if is_worth_it else None
 
     def _extend(self, newest: TrackedFrame | None) -> None:
         """Adds the last frame, if it comes after the last node: what is corrected there moves the frames before it as well."""
         if newest is not None and len(self.nodes) and newest.index > self.nodes.frames[-1]:
             self._add(newest)
 
-    def _sure(self) -> list[Link]:
-        return [link for link in self._links if link.kind not in (Kind.PENDING, Kind.FOUND)]
+    def _plan(self, node: int, by_frame: dict[int, PosedView]) -> None:
+        """Queues what is to be measured about a new keyframe."""
+        if len(self._tasks) > _MOST_TASKS:
+            self._tasks = [task for task in self._tasks if task.work not in (Work.LOOK, Work.COMPARE)]
+        for before in [self._active[-1 - gap] for gap in WINDOW if gap < len(self._active)]:
+            self._queue(Work.JOIN, before, node)
+        if self._old(node, by_frame):
+            for old in self._nearby(node, by_frame):
+                self._queue(Work.CLOSE, old, node)
+            if int(self.nodes.frames[node]) // self._every % _LOOK_EVERYWHERE == 0:
+                self._queue(Work.LOOK, node, node)
 
-    def _join_window(self, node: int, by_frame: dict[int, PosedView]) -> None:
-        """Measures the motions from the keyframes shortly before."""
-        for gap in WINDOW:
-            if gap >= len(self._active):
-                break
-            before = self._active[-1 - gap]
-            expected = motions.between(self.nodes.T_world_cam[node], self.nodes.T_world_cam[before])
-            found = self._aligned(before, node, by_frame, expected)
-            if found is None or np.abs(motions.log(found.T_second_first @ se3.inverse(expected))).max() > _MAX_SURPRISE:
-                continue
-            T, covariance = se3.inverse(found.T_second_first), found.weigh().covariance
-            self._links.append(Link.measured(before, node, T, Kind.WINDOW, covariance, node - before))
+    def _queue(self, work: Work, first: int, second: int) -> None:
+        T = self.nodes.T_world_cam
+        self._tasks.append(Task(work, first, second, motions.between(T[second], T[first])))
+
+    def _measure(self, by_frame: dict[int, PosedView], places: Places | None) -> None:
+        """Does as much of the work that waits as a frame has time for."""
+        left = self._work_per_frame
+        while self._tasks and (left >= COST[self._tasks[0].work] or left == self._work_per_frame):
+            task = self._tasks.pop(0)
+            left -= COST[task.work]
+            if task.work is Work.JOIN:
+                self._join(task, by_frame)
+            elif task.work is Work.CLOSE:
+                self._find_loop(task, by_frame)
+            elif places is not None and task.work is Work.LOOK:
+                self._look(task.second, by_frame, places)
+            elif places is not None:
+                self._compare(task, by_frame, places)
+
+    def _join(self, task: Task, by_frame: dict[int, PosedView]) -> None:
+        """Measures the motion from a keyframe shortly before."""
+        before, node = task.first, task.second
+        expected = motions.between(self.nodes.T_world_cam[node], self.nodes.T_world_cam[before])
+        found = self._aligned(before, node, by_frame, expected)
+        if found is None or np.abs(motions.log(found.T_second_first @ se3.inverse(expected))).max() > _MAX_SURPRISE:
+            return
+        T, covariance = se3.inverse(found.T_second_first), found.weigh().covariance
+        self._links.append(Link.measured(before, node, T, Kind.WINDOW, covariance, node - before))
 
     def _old(self, node: int, by_frame: dict[int, PosedView]) -> list[int]:
         """Returns the nodes of places that were mapped long ago."""
         frames = self.nodes.frames
         return [n for n in self._active if frames[n] in by_frame and frames[n] <= frames[node] - self._config.loop_after]
 
-    def _find_nearby(self, node: int, by_frame: dict[int, PosedView]) -> None:
-        """Finds loops to places that were mapped long ago, as seen from where the camera seems to be."""
-        frames, old = self.nodes.frames, self._old(node, by_frame)
-        if not old:
-            return
-        now = by_frame[int(frames[node])]
-        points = sample_points(now, _SAMPLES, np.random.default_rng([self._seed, int(frames[node])]))
-        seen = np.array(
-            overlaps(points, now.view.camera, [by_frame[int(frames[n])] for n in old], round(_MARGIN * now.view.camera.width))
-        )
-        is_found = False
-        for index in np.argsort(-seen, kind='stable')[:_CANDIDATES]:
-            if seen[index] < _LEAST_OVERLAP:
-                break
-            expected = motions.between(self.nodes.T_world_cam[node], self.nodes.T_world_cam[old[index]])
-            is_found |= self._find_loop(old[index], node, by_frame, expected)
-        if not is_found and int(frames[node]) // self._every % _LOOK_EVERYWHERE == 0:
-            self._look_at = node
+    def _nearby(self, node: int, by_frame: dict[int, PosedView]) -> list[int]:
+        """Returns the nodes of places mapped long ago that see most of what is seen from where the camera seems to be."""
+        old, now = self._old(node, by_frame), by_frame[int(self.nodes.frames[node])]
+        points = sample_points(now, _SAMPLES, np.random.default_rng([self._seed, now.frame]))
+        keyframes = [by_frame[int(self.nodes.frames[n])] for n in old]
+        seen = np.array(overlaps(points, now.view.camera, keyframes, round(_MARGIN * now.view.camera.width)))
+        return [old[index] for index in np.argsort(-seen, kind='stable')[:_CANDIDATES] if seen[index] >= _LEAST_OVERLAP]
 
-    def _find_anywhere(self, node: int, by_frame: dict[int, PosedView], places: Places) -> None:
-        """Finds loops to places that show the same features, wherever they are."""
+    def _look(self, node: int, by_frame: dict[int, PosedView], places: Places) -> None:
+        """Queues the comparison with places that show the same features, wherever they are, if none was found nearby."""
+        keyframe = by_frame.get(int(self.nodes.frames[node]))
+        is_found = any(link.second == node and link.kind not in (Kind.ODOMETRY, Kind.WINDOW) for link in self._links)
+        if is_found or keyframe is None:
+            return
         number = {int(self.nodes.frames[n]): n for n in self._old(node, by_frame)}
-        if not number:
-            return
-        view = by_frame[int(self.nodes.frames[node])].view
-        exclude = [frame for frame in by_frame if frame not in number]
-        for place in places.find(view, 1, exclude):
-            self._find_loop(number[place.keyframe], node, by_frame, place.T_cam_keyframe)
+        for frame in places.candidates(keyframe.view, [frame for frame in by_frame if frame not in number]):
+            if frame in number:
+                self._queue(Work.COMPARE, number[frame], node)
 
-    def _find_loop(self, first: int, second: int, by_frame: dict[int, PosedView], T_second_first: Matrix) -> bool:
-        """Adds the loop between two nodes that their images show, aligned from a motion [4, 4]; returns False if it is not sure."""
-        there = self._aligned(first, second, by_frame, T_second_first, and_back=True)
+    def _compare(self, task: Task, by_frame: dict[int, PosedView], places: Places) -> None:
+        """Compares the features of two keyframes; aligns them next if they show the same."""
+        frame, keyframe = int(self.nodes.frames[task.first]), by_frame.get(int(self.nodes.frames[task.second]))
+        if keyframe is None or frame not in places:
+            return
+        place = places.compare(frame, keyframe.view)
+        if place is not None:
+            self._tasks.insert(0, replace(task, work=Work.CLOSE, T_second_first=place.T_cam_keyframe))
+
+    def _find_loop(self, task: Task, by_frame: dict[int, PosedView]) -> None:
+        """Adds the loop between two nodes, if their images show it surely."""
+        there = self._aligned(task.first, task.second, by_frame, task.T_second_first, and_back=True)
         if there is None or (evidence := there.weigh()).explained < _LEAST_EXPLAINED:
-            return False
-        loop = Link.measured(first, second, se3.inverse(there.T_second_first), Kind.LOOP, evidence.covariance)
+            return
+        loop = Link.measured(task.first, task.second, se3.inverse(there.T_second_first), Kind.LOOP, evidence.covariance)
         self._links.append(replace(loop, kind=Kind.FOUND))
-        return True
 
     def _aligned(
         self, first: int, second: int, by_frame: dict[int, PosedView], T_second_first: Matrix, *, and_back: bool = False
@@ -308,31 +349,102 @@ class KeyframeGraph:
             return None
         return there
 
-    def _close(self, found: Sequence[Link], frame: TrackedFrame) -> Corrections | None:
-        """Adds loops, as far as they agree with the graph; returns the correction if they disagree with the present poses.
+    def _solve(self, frame: TrackedFrame) -> Corrections | None:
+        """Takes loops that were found into the graph, and optimises it, a few steps a frame.
 
         Args:
-            found: the loops.
-            frame: at which map and poses are corrected; it becomes a node.
+            frame: at which map and poses are corrected if the optimisation ends with it; it becomes a node.
+
+        Returns:
+            How they are corrected; None if they stay.
         """
-        loops = [one for loop in found for one in self._confirmed(replace(loop, kind=Kind.LOOP))]
-        if not any(self._off(loop) > self._config.min_correction_m for loop in loops):
-            self._links += loops
+        if self._solving is None:
+            if self._accept():
+                self._begin_solving()
             return None
-        self._add(frame)
-        links = [*self._sure(), *loops]
-        solution = self._optimized(links)
-        agreeing = [link for link, weight in zip(links, solution.weights) if link.kind is not Kind.LOOP or weight >= _LEAST_WEIGHT]
-        if len(agreeing) < len(links):
-            _log.info('%d loops contradict the graph at frame %d', len(links) - len(agreeing), self.nodes.frames[-1])
-            solution = self._optimized(agreeing)
-        self._links = [link for link in self._links if link.kind is Kind.PENDING] + agreeing
-        return self._corrections(solution) if any(loop is link for loop in loops for link in agreeing) else None
+        num_nodes = self._solving.num_nodes
+        solution = self._solved(_STEPS_PER_FRAME)
+        if solution is None:
+            return None
+        nodes, least = self._active[:num_nodes], self._config.min_correction_m
+        disagrees = any(self._off(loop) > least for loop in self.loops())
+        moves = size(motions.between(self.nodes.T_world_cam[nodes], solution)) > least
+        if not (disagrees and moves and self._is_drift(nodes, solution)):
+            return None
+        self._extend(frame)
+        return self._corrections(solution, nodes)
+
+    def _accept(self) -> bool:
+        """Takes the loops that were found into the graph. Returns whether one disagrees with the present poses."""
+        found = [link for link in self._links if link.kind is Kind.FOUND]
+        self._links = [link for link in self._links if link.kind is not Kind.FOUND]
+        loops = [one for loop in found for one in self._confirmed(replace(loop, kind=Kind.LOOP))]
+        self._links += loops
+        return any(self._off(loop) > self._config.min_correction_m for loop in loops)
+
+    def _begin_solving(self) -> None:
+        self._solving = self._solving_from(None, len(self._active), len(self._links))
+
+    def _solving_from(self, state: OptimizerState | None, num_nodes: int, num_links: int, *, is_second: bool = False) -> _Solving:
+        """Returns the optimisation of the first nodes and links, from a state of it."""
+        nodes = self._active[:num_nodes]
+        edges, T_world_cam = renumbered(self._sure(num_links), nodes), self.nodes.T_world_cam[nodes]
+        tracks = renumbered([link for link in self._sure(num_links) if link.kind is not Kind.LOOP], nodes)
+        T_world_cam = brought_together(T_world_cam, edges, parts(len(nodes), tracks))
+        _, firsts = np.unique(parts(len(nodes), edges), return_index=True)
+        num_loaded = int((self.nodes.frames[nodes] < 0).sum())
+        fixed = {*firsts.tolist(), *range(num_loaded + 1)}  # nothing that was loaded is anchored to a later frame than the first
+        return _Solving(Optimizer(PoseGraph.of(T_world_cam, edges, sorted(fixed)), state), num_nodes, num_links, is_second)
+
+    def _sure(self, count: int) -> list[Link]:
+        """Returns those of the first links that are not in doubt."""
+        return [link for link in self._links[:count] if link.kind not in (Kind.PENDING, Kind.FOUND)]
+
+    def _solved(self, most_steps: int = 10**6) -> Matrix | None:
+        """Goes on with the optimisation, first with all loops, then without those that contradict the others.
+
+        Returns:
+            The poses [N, 4, 4] of the nodes that take part; None as long as it goes on.
+        """
+        solving = self._solving
+        assert solving is not None
+        for _ in range(most_steps):
+            if solving.optimizer.state.is_done:
+                break
+            solving.optimizer.step()
+        if not solving.optimizer.state.is_done:
+            return None
+        self._solving, solution = None, solving.optimizer.solution()
+        poses = solution.T_world_cam if solution.is_better else solution.T_before
+        at = dict(zip(self._active, poses))
+        wrong = {
+            id(link) for link in self._sure(solving.num_links)
+            if link.kind is Kind.LOOP and deviations(link, at) > _MOST_WRONG
+        }  # fmt: skip
+        if not wrong:
+            return poses
+        _log.info('%d loops contradict the graph at frame %d', len(wrong), self.nodes.frames[-1])
+        self._links = [link for link in self._links if id(link) not in wrong]
+        if solving.is_second or not solution.is_better:
+            return poses
+        state = OptimizerState(poses, widening=1.0)
+        self._solving = self._solving_from(state, solving.num_nodes, solving.num_links - len(wrong), is_second=True)
+        return None
+
+    def _is_drift(self, nodes: Sequence[int], solution: Matrix) -> bool:
+        """Returns whether the poses [N, 4, 4] of a solution explain most of what loops disagree with the present ones.
+
+        If they do not, loops err by more than the poses: each of them says something else.
+        """
+        T_now, T_then = dict(zip(nodes, self.nodes.T_world_cam[nodes])), dict(zip(nodes, solution))
+        loops = [loop for loop in self.loops() if loop.first in T_now and loop.second in T_now]
+        now, then = (sum(np.square(contradiction(loop, T)[:3]).sum() for loop in loops) for T in (T_now, T_then))
+        return bool(then <= (1 - _LEAST_DRIFT) * now)
 
     def _off(self, loop: Link) -> float:
         """Returns by how much a loop would move its second node: m or rad, whichever is more."""
         T = self.nodes.T_world_cam
-        return _size(se3.inverse(loop.T_first_second) @ motions.between(T[loop.first], T[loop.second]))
+        return size(se3.inverse(loop.T_first_second) @ motions.between(T[loop.first], T[loop.second]))
 
     def _moved(self, loop: Link) -> Matrix:
         """Returns the motion [4, 4] of the world by which a loop would move its second node."""
@@ -341,31 +453,27 @@ class KeyframeGraph:
 
     def _confirmed(self, loop: Link) -> list[Link]:
         """Returns a loop, if it changes little or another one says the same, and then with that one; else it waits for one."""
-        if self._off(loop) <= _LARGE:
+        off = self._off(loop)
+        if off <= self._config.min_correction_m:
             return [loop]
-        T = self.nodes.T_world_cam[loop.second]
-        alike = [
+        T, alike = self.nodes.T_world_cam[loop.second], min(max(_SAME[0], 0.5 * off), _SAME[1])
+        others = [
             other for other in self._links
             if other.kind is Kind.PENDING and other.second != loop.second
-            and _size(se3.inverse(self._moved(other) @ T) @ self._moved(loop) @ T) < _SAME
+            and size(se3.inverse(self._moved(other) @ T) @ self._moved(loop) @ T) < alike
         ]  # fmt: skip
-        self._links = [link for link in self._links if not any(link is other for other in alike)]
-        if alike:
-            return [*(replace(other, kind=Kind.LOOP) for other in alike), loop]
+        self._links = [link for link in self._links if not any(link is other for other in others)]
+        if others:
+            return [*(replace(other, kind=Kind.LOOP) for other in others), loop]
         self._links.append(replace(loop, kind=Kind.PENDING))
         return []
 
-    def _optimized(self, links: Sequence[Link]) -> Solution:
-        number = np.full(len(self.nodes), -1)
-        number[self._active] = np.arange(len(self._active))
-        renumbered = [replace(edge, first=int(number[edge.first]), second=int(number[edge.second])) for edge in links]
-        return optimize(PoseGraph.of(self.nodes.T_world_cam[self._active], renumbered))
-
-    def _corrections(self, solution: Solution) -> Corrections:
-        T_last, T_before = self.nodes.T_world_cam[-1], self.nodes.T_world_cam[self._active]
-        corrections = Corrections.between(self.nodes.frames[self._active], T_before, solution.T_world_cam)
+    def _corrections(self, solution: Matrix, nodes: Sequence[int]) -> Corrections:
+        """Moves nodes to the poses [N, 4, 4] of a solution, and the others with them. Returns how the world moves."""
+        T_last, T_before = self.nodes.T_world_cam[-1], self.nodes.T_world_cam[nodes]
+        corrections = Corrections.between(self.nodes.frames[nodes], T_before, solution)
         T_world_cam = corrections.at(self.nodes.frames) @ self.nodes.T_world_cam
-        T_world_cam[self._active] = solution.T_world_cam
+        T_world_cam[nodes] = solution
         self.nodes = self.nodes.moved(T_world_cam)
         self.num_corrections += 1
         self._last_correction_m = float(np.linalg.norm(T_world_cam[-1, :3, 3] - T_last[:3, 3]))
@@ -373,28 +481,32 @@ class KeyframeGraph:
         return corrections
 
     def _merge(self, node: int) -> None:
-        """Takes a node out, because its images are gone. The nodes beside it are joined, and take over its loops."""
-        place = self._active.index(node)
-        before, after = self._active[place - 1], self._active[place + 1]
+        """Takes a node out, because its images are gone. The one beside it takes over its edges."""
         self._active.remove(node)
-        T, links, covariance = self.nodes.T_world_cam, self._links, np.zeros((6, 6))
-        self._links = []
-        for link in links:
-            if node not in (link.first, link.second):
-                self._links.append(link)
-            elif link.kind is Kind.ODOMETRY:
-                covariance += _inverse(link.information)
-            elif link.kind is not Kind.WINDOW and before not in (link.first, link.second):
-                step, is_first = motions.between(T[before], T[node]), link.first == node
-                motion = step @ link.T_first_second if is_first else link.T_first_second @ se3.inverse(step)
-                first, second = (before, link.second) if is_first else (link.first, before)
-                self._links.append(replace(link, first=first, second=second, T_first_second=motion))
-        self._links.append(Link(before, after, motions.between(T[before], T[after]), _inverse(covariance)))
+        own = [link for link in self._links if node in (link.first, link.second)]
+        self._links = [link for link in self._links if node not in (link.first, link.second)]
+        ways = {link.first + link.second - node: link for link in own if link.kind is Kind.ODOMETRY}  # by the node at the other end
+        if not ways:
+            return
+        T, into = self.nodes.T_world_cam, min(ways, key=lambda other: abs(other - node))
+        covariance = inverse(ways.pop(into).information)
+        for other, link in ways.items():
+            first, second = sorted((into, other))
+            information = inverse(covariance + inverse(link.information))
+            self._links.append(Link(first, second, motions.between(T[first], T[second]), information))
+        step = motions.between(T[into], T[node])
+        for link in own:
+            if link.kind in (Kind.ODOMETRY, Kind.WINDOW) or into in (link.first, link.second):
+                continue
+            is_first = link.first == node
+            motion = step @ link.T_first_second if is_first else link.T_first_second @ se3.inverse(step)
+            first, second = (into, link.second) if is_first else (link.first, into)
+            self._links.append(replace(link, first=first, second=second, T_first_second=motion))
 
     def rest(self) -> None:
         """Begins anew with the next keyframe, because time does; the map stays where it is."""
         self.nodes = Nodes()
-        self._active, self._links, self._look_at = [], [], None
+        self._active, self._links, self._tasks, self._solving = [], [], [], None
         self._is_interrupted = False
 
     def interrupt(self, newest: TrackedFrame | None) -> None:
@@ -404,14 +516,15 @@ class KeyframeGraph:
             newest: the last frame before that; None = the last node.
         """
         self._extend(newest)
-        self._look_at, self._is_interrupted = None, True
+        self._is_interrupted = True
 
     def drop_from(self, frame: int) -> None:
         """Forgets the keyframes of the frames from a number on."""
         self.nodes = self.nodes.before(frame)
         self._active = [node for node in self._active if node < len(self.nodes)]
         self._links = [link for link in self._links if max(link.first, link.second) < len(self.nodes)]
-        self._look_at = None
+        self._tasks = [task for task in self._tasks if max(task.first, task.second) < len(self.nodes)]
+        self._solving = None
         last = len(self.nodes) - 1
         if self._active and self._active[-1] < last:  # it was merged into a node that is gone; the next frame is joined to it
             before = self._active[-1]
@@ -437,9 +550,32 @@ class KeyframeGraph:
             'T_world_odom': self.T_world_odom,
             'num_corrections': np.array(self.num_corrections),
             'is_interrupted': np.array(self._is_interrupted),
-            'look_at': np.array(-1 if self._look_at is None else self._look_at),
+            **self._unfinished(),
             'last_correction_m': np.array(self._last_correction_m),
         }
+
+    def _unfinished(self) -> dict[str, NDArray[Any]]:
+        """Returns the work that waits and the optimisation that goes on, by name."""
+        tasks, solving = self._tasks, self._solving
+        state = OptimizerState(_NO_POSES, 1.0) if solving is None else solving.optimizer.state
+        counts = (0, 0, 0) if solving is None else (solving.num_nodes, solving.num_links, int(solving.is_second))
+        return {
+            'tasks': np.array([(task.work, task.first, task.second) for task in tasks], dtype=np.int64).reshape(-1, 3),
+            'task_motions': np.array([task.T_second_first for task in tasks]).reshape(-1, 4, 4),
+            'solving': np.array([*counts, state.steps_at_width, state.steps, state.is_done], dtype=np.int64),
+            'solving_widths': np.array([state.widening, state.damping]),
+            'solving_poses': state.T_world_cam,
+        }
+
+    def _restore_unfinished(self, arrays: Arrays) -> None:
+        """Continues with the work and the optimisation of ``_unfinished``."""
+        rows = zip(arrays['tasks'].tolist(), arrays['task_motions'], strict=True)
+        self._tasks = [Task(Work(work), first, second, T) for (work, first, second), T in rows]
+        num_nodes, num_links, is_second, at_width, steps, is_done = arrays['solving'].tolist()
+        if num_nodes:
+            widening, damping = arrays['solving_widths'].tolist()
+            state = OptimizerState(arrays['solving_poses'], widening, damping, at_width, steps, bool(is_done))
+            self._solving = self._solving_from(state, num_nodes, num_links, is_second=bool(is_second))
 
     def restore(self, arrays: Arrays) -> None:
         """Continues from the state of another graph; from nothing where there is none, as before 0.3.
@@ -454,18 +590,21 @@ class KeyframeGraph:
             raise ValueError(f'graph: {", ".join(broken)} is missing or of another type')
         if broken := [name for name in expected if name != 'limits' and not np.isfinite(arrays[name]).all()]:
             raise ValueError(f'graph: the numbers in {", ".join(broken)} are not finite')
-        num_nodes, num_links = len(arrays['frames']), len(arrays['kinds'])
-        shapes = {name: (num_nodes, *expected[name].shape[1:]) for name in Nodes.__dataclass_fields__}
-        shapes |= {name: (num_links, *expected[name].shape[1:]) for name in ('pairs', *_LINK_ARRAYS)}
+        num_nodes, num_links, num_tasks = len(arrays['frames']), len(arrays['kinds']), len(arrays['tasks'])
+        counts = dict.fromkeys(Nodes.__dataclass_fields__, num_nodes)
+        counts |= dict.fromkeys(('pairs', *_LINK_ARRAYS), num_links) | {'tasks': num_tasks, 'task_motions': num_tasks}
+        counts |= {'solving_poses': int(arrays['solving'].flat[0]) if arrays['solving'].size else 0}
+        shapes = {name: (count, *expected[name].shape[1:]) for name, count in counts.items()}
         shapes |= {name: expected[name].shape for name in _SINGLE_ARRAYS}
         if broken := [name for name, shape in shapes.items() if arrays[name].shape != shape]:
             raise ValueError(f'graph: {", ".join(broken)} has the wrong shape')
-        numbers = np.concatenate([arrays['pairs'].ravel(), arrays['active']])
-        if arrays['look_at'] >= num_nodes or (len(numbers) and not 0 <= numbers.min() <= numbers.max() < num_nodes):
-            raise ValueError(f'graph: pairs, active or look_at name nodes that are not among its {num_nodes}')
+        named = {'pairs': arrays['pairs'], 'active': arrays['active'], 'tasks': arrays['tasks'][:, 1:]}
+        if broken := [name for name, nodes in named.items() if nodes.size and not 0 <= nodes.min() <= nodes.max() < num_nodes]:
+            raise ValueError(f'graph: {", ".join(broken)} name nodes that are not among its {num_nodes}')
+        if not (0 <= arrays['solving'][0] <= len(arrays['active']) and 0 <= arrays['solving'][1] <= num_links):
+            raise ValueError('graph: solving goes on with more nodes or links than there are')
         self.nodes = Nodes(**{name: arrays[name] for name in Nodes.__dataclass_fields__})
         self._active, self._is_interrupted = arrays['active'].tolist(), bool(arrays['is_interrupted'])
-        self._look_at = None if arrays['look_at'] < 0 else int(arrays['look_at'])
         columns = [arrays[name] for name in ('pairs', *_LINK_ARRAYS)]
         self._links = [
             Link(int(first), int(second), T, information, float(limit), kind=Kind(kind))
@@ -473,12 +612,4 @@ class KeyframeGraph:
         ]
         self.T_world_odom, self.num_corrections = arrays['T_world_odom'], int(arrays['num_corrections'])
         self._last_correction_m = float(arrays['last_correction_m'])
-
-
-def _size(T: Matrix) -> float:
-    """Returns how far a motion [4, 4] moves or turns: m or rad, whichever is more."""
-    return float(np.linalg.norm(motions.log(T).reshape(2, 3), axis=1).max())
-
-
-def _inverse(covariance: Matrix) -> Matrix:
-    return np.linalg.inv(covariance).astype(np.float64, copy=False)
+        self._restore_unfinished(arrays)

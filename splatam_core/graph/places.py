@@ -40,6 +40,7 @@ _DEPTH_NOISE = 0.02, 0.01  # m, and relative to the depth: errors of the distanc
 _FAR_APART_M = 0.1  # points that are nearer to each other say little by their distance
 _NUM_SEEDS, _ROUNDS = 8, 3
 _MIN_INLIERS = 8
+_LEAST_DEPTH, _LEAST_FEATURES = 0.3, 100  # of the pixels, with depth: a view that shows a place, and not a hand or a wall
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,9 +89,13 @@ class Places:
 
     def __init__(self) -> None:
         self._keyframes: dict[int, _Keyframe] = {}
+        self._last: tuple[View, _Features] | None = None
 
     def __len__(self) -> int:
         return len(self._keyframes)
+
+    def __contains__(self, keyframe: int) -> bool:
+        return keyframe in self._keyframes
 
     def add(self, keyframe: int, view: View, T_cam_world: Matrix) -> None:
         """Adds a keyframe, or replaces that of the same number.
@@ -160,14 +165,26 @@ class Places:
             exclude: numbers of keyframes that are not considered.
             attempt: how often about the same view was looked for before.
         """
-        seen = _Features.of(view)
-        ranked = self._spread(self._ranked(seen.descriptors, exclude))
-        others = ranked[_NUM_ALIKE:]
-        first = attempt * _NUM_OTHERS % max(1, len(others))
-        chosen = [*ranked[:_NUM_ALIKE], *(others[first:] + others[:first])[:_NUM_OTHERS]]
-        places = [self._compare(number, seen) for number in chosen]
+        places = [self.compare(number, view) for number in self.candidates(view, exclude, attempt)]
         found = [place for place in places if place is not None]
         return sorted(found, key=lambda place: -place.num_inliers)[:limit]
+
+    def candidates(self, view: View, exclude: Collection[int] = (), attempt: int = 0) -> list[int]:
+        """Returns the numbers of the keyframes that are worth a comparison with a view. Arguments: see ``find``."""
+        ranked = self._spread(self._ranked(self._features(view).descriptors, exclude))
+        others = ranked[_NUM_ALIKE:]
+        first = attempt * _NUM_OTHERS % max(1, len(others))
+        return [*ranked[:_NUM_ALIKE], *(others[first:] + others[:first])[:_NUM_OTHERS]]
+
+    def compare(self, keyframe: int, view: View) -> Place | None:
+        """Returns where a view was perhaps taken, if it shows what a keyframe shows; None if too few features agree on a pose."""
+        return self._compare(keyframe, self._features(view))
+
+    def _features(self, view: View) -> _Features:
+        """Returns the features of a view; those of the last one are kept."""
+        if self._last is None or self._last[0] is not view:
+            self._last = view, _Features.of(view)
+        return self._last[1]
 
     def _ranked(self, descriptors: NDArray[np.uint8], exclude: Collection[int]) -> list[int]:
         """Returns the numbers of the keyframes, the one with most keys of the descriptors [K, 32] first."""
@@ -206,6 +223,12 @@ class Places:
         T, inliers = matches.pose()
         num_inliers = int(inliers.sum())
         return None if num_inliers < _MIN_INLIERS else Place(number, T, T @ keyframe.T_cam_world, len(pairs), num_inliers)
+
+
+def shows_a_place(view: View) -> bool:
+    """Returns whether a view, in the host's memory, has enough depth and features to be recognised later."""
+    has_depth = float(view.valid.float().mean()) >= _LEAST_DEPTH
+    return has_depth and int((_Features.of(view).points[:, 2] > 0).sum()) >= _LEAST_FEATURES
 
 
 @dataclass(frozen=True, slots=True, eq=False)

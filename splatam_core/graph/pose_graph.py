@@ -104,28 +104,100 @@ class Solution:
         squared_errors: [E] of the edges, in standard deviations.
         weights: [E] that the kernels leave them, in [0, 1].
         steps: number of steps taken.
+        T_before: [N, 4, 4] the poses from which the optimisation began.
+        is_better: True if the edges, those with a limit counted up to it, agree at least as well as they did there.
     """
 
     T_world_cam: Matrix
     squared_errors: Vector
     weights: Vector
     steps: int
+    T_before: Matrix
+    is_better: bool
 
 
 def optimize(graph: PoseGraph) -> Solution:
     """Returns the poses that agree best with the edges, found from those of the graph."""
-    at = _Estimate.of(graph, graph.T_world_cam)
-    limited = np.isfinite(graph.limits)
-    widening = max(1.0, 2 * float((at.squared[limited] / graph.limits[limited]).max(initial=0.0)))
-    steps = 0
-    while not graph.is_fixed.all():
-        is_last = widening == 1.0
-        at, taken = _descend(graph, at, widening * graph.limits, _MAX_STEPS if is_last else _STEPS_BETWEEN)
-        steps += taken
-        if is_last:
-            break
-        widening = max(1.0, widening / _NARROWING)
-    return Solution(_orthonormal(at.T_world_cam), at.squared, _weights(at.squared, graph.limits), steps)
+    optimizer = Optimizer(graph)
+    while not optimizer.state.is_done:
+        optimizer.step()
+    return optimizer.solution()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OptimizerState:
+    """How far an optimisation is.
+
+    Attributes:
+        T_world_cam: [N, 4, 4] poses so far.
+        widening: factor by which the kernels are wider than in the end.
+        damping: of the next step.
+        steps_at_width: number of steps taken with these kernels.
+        steps: number of all steps taken.
+        is_done: True if no further step helps.
+    """
+
+    T_world_cam: Matrix
+    widening: float
+    damping: float = _FIRST_DAMPING
+    steps_at_width: int = 0
+    steps: int = 0
+    is_done: bool = False
+
+
+class Optimizer:
+    """Finds the poses that agree best with edges, a step at a time, so that the work can be spread over frames.
+
+    Attributes:
+        state: how far it is.
+    """
+
+    def __init__(self, graph: PoseGraph, state: OptimizerState | None = None) -> None:
+        """Begins, or continues from a state of the same graph."""
+        self._graph = graph
+        self._at = _Estimate.of(graph, graph.T_world_cam if state is None else state.T_world_cam)
+        self.state = self._first_state() if state is None else state
+
+    def _first_state(self) -> OptimizerState:
+        limited = np.isfinite(self._graph.limits)
+        widening = max(1.0, 2 * float((self._at.squared[limited] / self._graph.limits[limited]).max(initial=0.0)))
+        return OptimizerState(self._at.T_world_cam, widening, is_done=bool(self._graph.is_fixed.all()))
+
+    def step(self) -> None:
+        """Takes one step of Levenberg and Marquardt; narrows the kernels where steps have become small."""
+        state, limits = self.state, self.state.widening * self._graph.limits
+        cost, damping, is_small = _cost(self._at.squared, limits), state.damping, False
+        step = _step(self._graph, self._at.T_world_cam, self._at.errors, _weights(self._at.squared, limits), damping)
+        there = self._at if step is None else _Estimate.of(self._graph, self._at.T_world_cam @ motions.exp(step))
+        cost_there = _cost(there.squared, limits)
+        if step is None or not cost_there <= cost:
+            damping *= 10
+        else:
+            self._at, damping = there, max(damping / 10, _LEAST_DAMPING)
+            is_small = bool(np.abs(step).max() < _SMALL_STEP) or cost - cost_there <= _SMALL_GAIN * cost_there
+        is_last, count = state.widening == 1.0, state.steps_at_width + 1
+        ends = is_small or damping >= _MOST_DAMPING or count >= (_MAX_STEPS if is_last else _STEPS_BETWEEN)
+        self.state = OptimizerState(
+            self._at.T_world_cam,
+            widening=max(1.0, state.widening / _NARROWING) if ends else state.widening,
+            damping=_FIRST_DAMPING if ends else damping,
+            steps_at_width=0 if ends else count,
+            steps=state.steps + 1,
+            is_done=ends and is_last,
+        )
+
+    def solution(self) -> Solution:
+        """Returns the poses so far."""
+        squared, limits = self._at.squared, self._graph.limits
+        before = _Estimate.of(self._graph, self._graph.T_world_cam).squared
+        return Solution(
+            T_world_cam=_orthonormal(self._at.T_world_cam),
+            squared_errors=squared,
+            weights=_weights(squared, limits),
+            steps=self.state.steps,
+            T_before=self._graph.T_world_cam,
+            is_better=_cost(squared, limits) <= _cost(before, limits),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,24 +212,6 @@ class _Estimate:
     def of(cls, graph: PoseGraph, T_world_cam: Matrix) -> _Estimate:
         errors = graph.errors(T_world_cam)
         return cls(T_world_cam, errors, graph.squared(errors))
-
-
-def _descend(graph: PoseGraph, at: _Estimate, limits: Vector, max_steps: int) -> tuple[_Estimate, int]:
-    """Takes steps until they are small. Returns where they lead, and their number."""
-    damping, steps, cost = _FIRST_DAMPING, 0, _cost(at.squared, limits)
-    while steps < max_steps and damping < _MOST_DAMPING:
-        steps += 1
-        step = _step(graph, at.T_world_cam, at.errors, _weights(at.squared, limits), damping)
-        there = at if step is None else _Estimate.of(graph, at.T_world_cam @ motions.exp(step))
-        cost_there = _cost(there.squared, limits)
-        if step is None or not cost_there <= cost:
-            damping *= 10
-            continue
-        gained, at, cost = cost - cost_there, there, cost_there
-        damping = max(damping / 10, _LEAST_DAMPING)
-        if np.abs(step).max() < _SMALL_STEP or gained <= _SMALL_GAIN * cost:
-            break
-    return at, steps
 
 
 def _cost(squared: Vector, limits: Vector) -> float:

@@ -134,6 +134,28 @@ def unknown() -> tuple[TrackingResult, Verdict]:
     return nowhere, Verdict(Status.LOST, 'the camera has seen no place of the map yet that it recognises')
 
 
+def recognise(sight: Sight, places: Places, tracked: TrackingResult, attempt: int = 0) -> Recognition | None:
+    """Looks for a place that shows what a frame shows.
+
+    Args:
+        sight: the frame.
+        places: the keyframes.
+        tracked: its pose from the usual tracking.
+        attempt: how often the camera was looked for since it was lost.
+
+    Returns:
+        The pose there; None if no place explains the frame better than the pose tracked, or two places do.
+    """
+    tried = [_aligned(sight, place.T_cam_world, place.keyframe) for place in sight.places(places, attempt=attempt)]
+    best, recognition = tracked, None
+    for aligned in filter(None, tried):
+        if better(best, aligned.result, sight.config) is aligned.result:
+            best, recognition = aligned.result, aligned.recognition
+    is_here = not verify(tracked, sight.config) and max(_apart(best.T_cam_world, tracked.T_cam_world)) <= SAME_PLACE
+    is_ambiguous = any(aligned is not None and are_equal(best, aligned.result, sight.config) for aligned in tried)
+    return None if is_here or is_ambiguous else recognition
+
+
 class Relocaliser:
     """Looks for a camera that is not tracked, in a bounded number of frames and places.
 
@@ -200,17 +222,8 @@ class Relocaliser:
 
     def _recognise(self, sight: Sight, tracked: TrackingResult) -> None:
         """Looks for a place that shows what the frame shows, and better than the pose at which it was tracked."""
-        tried = [
-            _aligned(sight, place.T_cam_world, place.keyframe)
-            for place in sight.places(self.places, attempt=self.state.num_in_doubt // _EAGER_EVERY)
-        ]
-        best, recognition = tracked, None
-        for aligned in filter(None, tried):
-            if better(best, aligned.result, sight.config) is aligned.result:
-                best, recognition = aligned.result, aligned.recognition
-        is_here = not verify(tracked, sight.config) and max(_apart(best.T_cam_world, tracked.T_cam_world)) <= SAME_PLACE
-        is_ambiguous = any(aligned is not None and are_equal(best, aligned.result, sight.config) for aligned in tried)
-        self.state = replace(self.state, recognised=None if is_here or is_ambiguous else recognition)
+        recognised = recognise(sight, self.places, tracked, attempt=self.state.num_in_doubt // _EAGER_EVERY)
+        self.state = replace(self.state, recognised=recognised)
 
     def _try_told(self, sight: Sight) -> None:
         """Tries the pose that a person told, and what the keyframes near it suggest."""
@@ -236,7 +249,7 @@ class Relocaliser:
         judge = Judge()
         judge.state = JudgeState(covariance=before.covariance)
         result, verdict = judge.decide(result, prediction, sight.config)
-        if verdict.status is not Status.TRACKED or not _is_convincing(result):
+        if verdict.status is not Status.TRACKED or not is_convincing(result):
             if before.keyframe == TOLD:
                 _log.warning('the pose that was told is refused: the next frame does not confirm it')
             return None
@@ -265,7 +278,7 @@ def _aligned(
     result = sight.tracker.track(sight.view, sight.gaussians, T_cam_world)
     guess, judge = se3.inverse(T_cam_world), Judge()
     result, verdict = judge.decide(result, Prediction(guess, guess, math.inf, is_guess=True), sight.config)
-    if verdict.status is not Status.TRACKED or not _is_convincing(result):
+    if verdict.status is not Status.TRACKED or not is_convincing(result):
         return None
     shift_m, turn_rad = _apart(result.T_cam_world, T_cam_world)
     if shift_m > max_shift_m or turn_rad > max_turn_rad:
@@ -274,7 +287,7 @@ def _aligned(
     return _Aligned(result, Recognition(sight.stamp_ns, pose, judge.state.covariance, keyframe))
 
 
-def _is_convincing(result: TrackingResult) -> bool:
+def is_convincing(result: TrackingResult) -> bool:
     """Returns whether a pose explains a frame so well that it needs no frame before it."""
     evidence = result.evidence
     is_determined = evidence is None or (not evidence.num_open and evidence.explained >= _MIN_EXPLAINED)

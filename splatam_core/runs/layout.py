@@ -46,7 +46,7 @@ PREVIOUS = 'previous'
 KEYFRAMES = 'keyframes'
 
 
-PROGRAMS = ('splatam run', 'splatam refine', 'splatam_node')
+PROGRAMS = ('splatam run', 'splatam refine', 'splatam merge', 'splatam_node')
 """What writes run folders, as ``run.json`` names it."""
 
 

@@ -75,7 +75,7 @@ class RunDescription:
     """Where a run comes from.
 
     Attributes:
-        program: what wrote it: ``splatam run``, ``splatam refine`` or ``splatam_node``.
+        program: what wrote it: ``splatam run``, ``splatam refine``, ``splatam merge`` or ``splatam_node``.
         preset: the preset it started from; None = the defaults.
         source: the recording; None = live topics.
         checkpoint_every: frames from one checkpoint to the next; None = no checkpoints.

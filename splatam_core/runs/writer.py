@@ -116,7 +116,7 @@ class RunFolder:
                 remove_run(path)
             check_is_free(path)
             path.mkdir(parents=True, exist_ok=True)
-            return cls._begin(path, config, _run_information(description) | {'backend': backend})
+            return cls._begin(path, config, run_information(description) | {'backend': backend})
         except (OSError, ValueError) as error:  # ValueError: a NUL in the path
             raise RunFolderError(f'{path}: cannot be written: {why_not(error)}; choose another folder') from None
 
@@ -139,9 +139,9 @@ class RunFolder:
     @classmethod
     def _begin(cls, path: Path, config: SlamConfig, information: dict[str, Any]) -> RunFolder:
         replace_text(path / CONFIG, to_yaml(config))
-        replace_text(path / RUN, _to_json(information))
+        replace_text(path / RUN, as_json(information))
         folder = cls(path)
-        folder._frames.write(_csv_row(CSV_HEADER))
+        folder._frames.write(csv_row(CSV_HEADER))
         return folder
 
     @property
@@ -168,7 +168,7 @@ class RunFolder:
             RunFolderError: the folder cannot be written; nothing has changed.
         """
         information = _information(self.path) | {'camera': None, 'started': _now()}
-        texts = {CONFIG: to_yaml(config), RUN: _to_json(information), FRAMES: _csv_row(CSV_HEADER) + '\n'}
+        texts = {CONFIG: to_yaml(config), RUN: as_json(information), FRAMES: csv_row(CSV_HEADER) + '\n'}
         try:
             self.sync()
             (self.path / PREVIOUS).mkdir(exist_ok=True)
@@ -232,7 +232,7 @@ class RunFolder:
         self._statistics.add(record)
         with ExitStack() as each:  # all are tried, from the last to the first, whichever fails
             each.callback(self._write_camera)
-            each.callback(self._frames.write, _csv_row(record.csv_row()))
+            each.callback(self._frames.write, csv_row(record.csv_row()))
             each.callback(self._trajectory.write, trajectory_line(result))
 
     def sync(self) -> None:
@@ -249,7 +249,7 @@ class RunFolder:
         }  # fmt: skip
         before = information.get('resumed')
         information['resumed'] = [*(before if isinstance(before, list) else []), resumption]
-        replace_text(self.path / RUN, _to_json(information))
+        replace_text(self.path / RUN, as_json(information))
 
     def save(self, slam: SavableSlam, finish_s: float = 0.0) -> Metrics:
         """Writes ``map.ply``, its keyframes, the corrected poses, ``metrics.json`` and the present settings.
@@ -272,7 +272,7 @@ class RunFolder:
         else:
             (self.path / MAP_KEYFRAMES).unlink(missing_ok=True)
         self._write_final_trajectory(slam.graph)
-        metrics = _metrics_of_this_process(self._statistics, len(gaussians), finish_s)
+        metrics = metrics_of_this_process(self._statistics, len(gaussians), finish_s)
         if slam.graph.is_used:
             metrics = replace(metrics, loops=slam.graph.num_loops, corrections=slam.graph.num_corrections)
         if slam.map.num_refused:
@@ -323,7 +323,7 @@ class RunFolder:
     def _write_camera(self) -> None:
         """Writes the camera of the first frame, once it fits on the disk."""
         if self._camera is not None and not self._has_camera:
-            replace_text(self.path / RUN, _to_json(_information(self.path) | {'camera': asdict(self._camera)}))
+            replace_text(self.path / RUN, as_json(_information(self.path) | {'camera': asdict(self._camera)}))
             self._has_camera = True
 
 
@@ -352,9 +352,9 @@ def write_refined(run: RunRecord, path: Path, gaussians: Gaussians, iterations: 
             for name in (TRAJECTORY, FINAL_TRAJECTORY, FRAMES, CONFIG, MAP_KEYFRAMES):
                 if (run.path / name).exists():
                     shutil.copy2(run.path / name, folder)
-            replace_text(folder / RUN, _to_json(information))
+            replace_text(folder / RUN, as_json(information))
             write_ply(folder / MAP, gaussians)
-            replace_text(folder / METRICS, _metrics_of_this_process(FrameStatistics(run.frames), len(gaussians)).to_json())
+            replace_text(folder / METRICS, metrics_of_this_process(FrameStatistics(run.frames), len(gaussians)).to_json())
     except OSError as error:
         raise RunFolderError(f'{path}: cannot be written: {why_not(error)}; choose another folder') from None
 
@@ -392,12 +392,14 @@ def _present_header(line: str) -> str:
     return ','.join([*columns, *CSV_HEADER[len(columns) :]]) + '\n'
 
 
-def _metrics_of_this_process(statistics: FrameStatistics, num_gaussians: int, finish_s: float = 0.0) -> Metrics:
+def metrics_of_this_process(statistics: FrameStatistics, num_gaussians: int, finish_s: float = 0.0) -> Metrics:
+    """Returns what is known without ground truth of a run that this process makes."""
     peak_rss_mb, peak_gpu_mb = provenance.peak_rss_mb(), provenance.peak_gpu_mb()
     return statistics.metrics(num_gaussians, peak_rss_mb, peak_gpu_mb=peak_gpu_mb, finish_s=finish_s)
 
 
-def _run_information(description: RunDescription) -> dict[str, Any]:
+def run_information(description: RunDescription) -> dict[str, Any]:
+    """Returns what ``run.json`` says of a run that begins now; its camera is not known yet."""
     return {
         **asdict(description),
         'camera': None,
@@ -412,11 +414,13 @@ def _now() -> str:
     return datetime.now(timezone.utc).isoformat(timespec='seconds')
 
 
-def _to_json(values: dict[str, Any]) -> str:
+def as_json(values: dict[str, Any]) -> str:
+    """Returns values as the text of a file."""
     return json.dumps(values, indent=2) + '\n'
 
 
-def _csv_row(row: list[str]) -> str:
+def csv_row(row: list[str]) -> str:
+    """Returns cells as a line of a table, without its newline."""
     text = io.StringIO()
     csv.writer(text, lineterminator='').writerow([cell.replace('\0', '') for cell in row])
     return ' '.join(text.getvalue().splitlines())  # a reason is one line, whatever it quotes

@@ -81,7 +81,7 @@ def test_without_a_graph_nothing_is_kept(there_and_back: list[RgbdFrame]) -> Non
     assert (slam.graph.corrected(np.array([result.stamp_ns for result in results]), poses) == poses).all()
 
 
-@pytest.mark.parametrize(('broken', 'costs_the_frame'), [('track', True), ('_find_nearby', False)])
+@pytest.mark.parametrize(('broken', 'costs_the_frame'), [('track', True), ('_plan', False)])
 def test_a_system_that_cannot_be_solved_costs_at_most_the_frame(
     there_and_back: list[RgbdFrame],
     monkeypatch: pytest.MonkeyPatch,

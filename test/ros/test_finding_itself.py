@@ -92,3 +92,18 @@ def test_a_camera_is_found_in_a_saved_map_carried_away_and_told(graph: Graph, wa
     live.node.send(signal.SIGINT)
     assert live.node.wait() == 0
     np.testing.assert_array_equal(read_ply(out / 'map.ply').means, read_ply(walk.folder / 'map.ply').means)
+
+
+@pytest.mark.slow
+def test_a_camera_lost_where_nothing_is_mapped_starts_a_new_map(graph: Graph) -> None:
+    """Beside the old one, in the same frame, after as many frames as are set."""
+    live = Live(
+        graph, preset='realtime', slam__graph__enabled=True, slam__tracking__align__relocalisation__on_lost='new_map',
+        slam__tracking__align__relocalisation__new_map_after=3, slam__tracking__min_inlier_fraction=0.75,
+    )  # fmt: skip
+    sequence = open_sequence('synthetic:motion=fast', width=160)  # it turns by a third of a circle from frame 4 to 80
+    frames = [replace(sequence[index], stamp_ns=10**9 + k * STEP_NS) for k, index in enumerate([*range(4), *range(80, 90)])]
+    shown = [live.show(frame) for frame in frames]
+    assert all(shown[:4]) and shown[4] is None and shown[-1] is not None
+    live.wait_says('a new map starts beside it')
+    assert np.linalg.norm(poses.pose_matrix(shown[-1].pose)[:3, 3]) > 20

@@ -1,0 +1,137 @@
+"""The edges of the keyframe graph, and the work that measures them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatam_core.geometry import motions, se3
+from splatam_core.geometry.se3 import Matrix, Vector
+from splatam_core.graph.pose_graph import Edge
+
+_FAR_M = 5.0  # of a new map that lies beside the old one: more than drift
+_LIMIT = 60.0  # of the squared error of an edge, in standard deviations of six numbers
+
+
+class Kind(IntEnum):
+    """What an edge was measured by."""
+
+    ODOMETRY = 0
+    WINDOW = 1
+    LOOP = 2
+    PENDING = 3  # a loop that no other one confirms yet
+    FOUND = 4  # a loop that nobody has compared with the graph yet
+
+
+_DEVIATIONS = {Kind.ODOMETRY: (0.008, 0.004), Kind.WINDOW: (0.01, 0.006), Kind.LOOP: (0.02, 0.012)}
+"""Errors (m, rad) that images do not show, such as those of calibration; from one keyframe to the next, or of a loop."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Link(Edge):
+    """An edge, and what it was measured by."""
+
+    kind: Kind = Kind.ODOMETRY
+
+    @classmethod
+    def measured(cls, first: int, second: int, T: Matrix, kind: Kind, covariance: Matrix, factor: float = 1.0) -> Link:
+        """Returns a link between two nodes.
+
+        Args:
+            first: number of a node.
+            second: of another one.
+            T: [4, 4] the motion between them.
+            kind: what it was measured by, which has errors of its own.
+            covariance: [6, 6] of the motion as the images say.
+            factor: by which the errors of its kind are larger than usual.
+        """
+        own = np.diag(np.repeat(np.square(factor * np.array(_DEVIATIONS[kind])), 3))
+        return cls(first, second, T, inverse(own + covariance), np.inf if kind is Kind.ODOMETRY else _LIMIT, kind=kind)
+
+
+class Work(IntEnum):
+    """What a task does."""
+
+    JOIN = 0  # align two keyframes of the window
+    CLOSE = 1  # align two keyframes that are long apart, there and back
+    LOOK = 2  # find keyframes that show the same features
+    COMPARE = 3  # match the features of two keyframes
+
+
+COST = {Work.JOIN: 1, Work.CLOSE: 2, Work.LOOK: 1, Work.COMPARE: 1}
+"""How much work a task is, in alignments of two keyframes."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """Work that waits for a frame that has time for it.
+
+    Attributes:
+        work: what is to be done.
+        first: number of a node; of LOOK it is that of the second.
+        second: number of the node that came later.
+        T_second_first: [4, 4] where alignment starts: camera of the first to camera of the second.
+    """
+
+    work: Work
+    first: int
+    second: int
+    T_second_first: Matrix
+
+
+def size(T: Matrix) -> float:
+    """Returns how far motions [..., 4, 4] move or turn at most: m or rad, whichever is more."""
+    twists = motions.log(T)
+    return float(np.linalg.norm(twists.reshape(*twists.shape[:-1], 2, 3), axis=-1).max(initial=0.0))
+
+
+def contradiction(link: Link, T_world_cam: Mapping[int, Matrix]) -> Vector:
+    """Returns the twist [6] by which poses [4, 4], by node, contradict a link."""
+    between = motions.between(T_world_cam[link.first], T_world_cam[link.second])
+    return motions.log(se3.inverse(link.T_first_second) @ between)
+
+
+def deviations(link: Link, T_world_cam: Mapping[int, Matrix]) -> float:
+    """Returns by how many of the deviations of its kind poses [4, 4], by node, contradict a link, in position or rotation."""
+    lengths = np.linalg.norm(contradiction(link, T_world_cam).reshape(2, 3), axis=1)
+    return float((lengths / _DEVIATIONS[link.kind]).max())
+
+
+def inverse(covariance: Matrix) -> Matrix:
+    """Returns the information [6, 6] of a covariance, or the other way round."""
+    return np.linalg.inv(covariance).astype(np.float64, copy=False)
+
+
+def renumbered(links: Sequence[Link], nodes: Sequence[int]) -> list[Edge]:
+    """Returns links as edges between the places of their nodes in a list."""
+    place = {node: index for index, node in enumerate(nodes)}
+    return [Edge(place[link.first], place[link.second], link.T_first_second, link.information, link.limit) for link in links]
+
+
+def parts(count: int, edges: Sequence[Edge]) -> NDArray[np.intp]:
+    """Returns [N] for each of so many poses the first pose that edges connect it to, over any number of others."""
+    part = np.arange(count)
+    for edge in edges:
+        ends = part[[edge.first, edge.second]]
+        if ends[0] != ends[1]:
+            part[part == ends.max()] = ends.min()
+    return part
+
+
+def brought_together(T_world_cam: Matrix, edges: Sequence[Edge], part: NDArray[np.intp]) -> Matrix:
+    """Returns poses [N, 4, 4], of which the parts [N] that lie far from where an edge says are moved there as a whole."""
+    result, done = T_world_cam.copy(), {0}
+    for edge in sorted(edges, key=lambda edge: max(edge.first, edge.second)):
+        ends = [int(part[edge.first]), int(part[edge.second])]
+        if ends[0] == ends[1] or (ends[0] in done) == (ends[1] in done):
+            continue
+        place = result[edge.first] @ edge.T_first_second @ se3.inverse(result[edge.second])
+        late, motion = (ends[1], place) if ends[0] in done else (ends[0], se3.inverse(place))
+        done.add(late)
+        if np.linalg.norm(motions.log(motion)[:3]) > _FAR_M:
+            result[part == late] = motion @ result[part == late]
+    return result
