@@ -82,7 +82,8 @@ struct Target {
   float color_limit, depth_limit;  // up to here Huber's loss is quadratic
 };
 
-// Adam (Kingma and Ba 2015). A Gaussian's values in this order: mean, log scale, logit opacity, rgb.
+// Adam (Kingma and Ba 2015) with Nesterov's momentum (Dozat 2016). A Gaussian's values in this order: mean, log scale,
+// logit opacity, rgb.
 struct AdamState {
   float* moments;       // [N, 16]: first moments, then second
   std::uint8_t* steps;  // [N], counts to 255

@@ -489,13 +489,13 @@ static double fit(const TileList& tile, const Splat* splats, const Camera& camer
   return loss;
 }
 
-constexpr float kBeta1 = 0.9f, kBeta2 = 0.99f, kEpsilon = 1e-15f;
+constexpr float kBeta1 = 0.9f, kBeta2 = 0.9f, kEpsilon = 1e-15f;
 
-// Adam's bias corrections, by the number of steps.
+// Adam's bias corrections, by the number of steps; of the first moment as it is one step ahead.
 struct BiasCorrections {
   float first[256], second[256];
   constexpr BiasCorrections() : first(), second() {
-    float left1 = 1.0f, left2 = 1.0f;
+    float left1 = kBeta1, left2 = 1.0f;
     for (int i = 0; i < 256; ++i) {
       first[i] = 1.0f - left1, second[i] = 1.0f - left2;
       left1 *= kBeta1, left2 *= kBeta2;
@@ -524,15 +524,16 @@ static inline unsigned by_gaussians(const Splat* splats, const SplatGradient* gr
                       (gradient.b != 0.0f) | (gradient.z != 0.0f));
 }
 
-// Takes an Adam step of one Gaussian. Widens the bounds, which are in the order of the gradient.
+// Takes a step of one Gaussian: Adam with Nesterov's momentum. Widens the bounds, which are in the order of the
+// gradient.
 static inline void adam_step(std::size_t id, Lanes gradient, Lanes rate, const MutableGaussians& gaussians,
                              const AdamState& adam, Lanes* lowest, Lanes* highest) {
   float* moments = adam.moments + 16 * id;
   const Lanes first = kBeta1 * load(moments) + (1.0f - kBeta1) * gradient;
   const Lanes second = kBeta2 * load(moments + 8) + (1.0f - kBeta2) * gradient * gradient;
   const int step = adam.steps[id] < 255 ? adam.steps[id] + 1 : 255;
-  const Lanes move =
-      rate * (first / kBiasCorrections.first[step]) / (sqrt(second / kBiasCorrections.second[step]) + kEpsilon);
+  const Lanes ahead = (kBeta1 * first + (1.0f - kBeta1) * gradient) / kBiasCorrections.first[step];
+  const Lanes move = rate * ahead / (sqrt(second / kBiasCorrections.second[step]) + kEpsilon);
   const IntLanes usable = (absolute(first) < kHuge) & (second < kHuge) & (absolute(move) < kHuge);
   if (bits_of_mask(usable) != 0xff) return;  // an overflow would stay in the moments for ever
   store(moments, first);

@@ -35,7 +35,7 @@ MAX_ALPHA = 0.99
 MIN_ALPHA = 1.0 / 255.0
 MIN_TRANSMITTANCE = 1e-4
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
-FIT_BETA_2 = 0.99
+FIT_BETA_2 = 0.9
 """Of ``fit``, whose moments are kept from frame to frame: a shorter mean follows changes of the view (docs/decisions/0004)."""
 
 COLOR_LIMIT, DEPTH_LIMIT_M = 0.1, 0.02
@@ -248,7 +248,7 @@ class Rasterizer(Protocol):
         ...
 
     def fit(self, gaussians: Gaussians, moments: Moments, rates: Rates, target: Target) -> float | Tensor:
-        """Takes one Adam step towards a target, in place. Gaussians without a gradient do not change.
+        """Takes one step of Adam with Nesterov's momentum towards a target, in place. Gaussians without a gradient do not change.
 
         Returns:
             The loss before the step. On a GPU it is a scalar tensor, so that the host waits only when it reads it.

@@ -74,7 +74,8 @@ class ReferenceRasterizer:
         first, second = BETA_1 * first + (1 - BETA_1) * gradient, FIT_BETA_2 * second + (1 - FIT_BETA_2) * gradient**2
         moments.first_second[seen] = torch.cat([first, second], dim=1).to(moments.first_second.dtype)
         rate = torch.tensor([rates.means] * 3 + [rates.log_scales, rates.logit_opacities] + [rates.rgb] * 3).to(step.device)
-        move = rate * (first / (1 - BETA_1**step)) / ((second / (1 - FIT_BETA_2**step)).sqrt() + EPSILON)
+        ahead = (BETA_1 * first + (1 - BETA_1) * gradient) / (1 - BETA_1 ** (step + 1))  # Nesterov's momentum
+        move = rate * ahead / ((second / (1 - FIT_BETA_2**step)).sqrt() + EPSILON)
         for value, moved in zip(values, move.split([3, 1, 1, 3], dim=1), strict=True):
             value[seen] -= moved.to(value.dtype)
         return loss.item()

@@ -18,7 +18,7 @@ from splatam_core.mapping.gaussian_map import PARAMETERS, GaussianMap
 from splatam_core.mapping.keyframes import KeyframeStore, draw, overlaps, select_keyframes, views_to_fit
 from splatam_core.mapping.loss import mapping_loss
 from splatam_core.mapping.optimizers import TimeLimit, fused, make_optimizer, prunable
-from splatam_core.mapping.optimizers.fused import FINAL_FIRST, FINAL_LAST, FINAL_MEANS
+from splatam_core.mapping.optimizers.fused import FINAL_COLORS, FINAL_FIRST, FINAL_LAST, FINAL_MEANS
 from splatam_core.mapping.posed import PosedView
 from splatam_core.mapping.schedule import MappingSchedule
 from splatam_core.rasterizer import Gaussians, Moments, Rasterizer, Rates, Render, Target, joined, make_rasterizer
@@ -205,17 +205,16 @@ def _finish(
 
 
 def test_finishing_fits_every_keyframe_as_often_with_fading_steps() -> None:
-    """Each pass has all three, in an order of its own; step sizes fade evenly (by the same factor each step)."""
+    """Each pass has all three, in an order of its own; step sizes fade along half a cosine."""
     keyframes = [PosedView(_view(), _at(0.1 * i)) for i in range(3)]
     rasterizer, config = _Listed(), _finishing(7)
     assert _finish(keyframes, rasterizer, config, np.random.default_rng(0)) == 21
     x = [round(-10 * float(target.T_cam_world[0, 3])) for _, target in rasterizer.asked]
     passes = [tuple(x[i : i + 3]) for i in range(0, 21, 3)]
     assert {frozenset(one) for one in passes} == {frozenset({0, 1, 2})} and len(set(passes)) > 1
-    colours = np.array([rates.rgb for rates, _ in rasterizer.asked]) / config.rgb_rate
-    fading = (FINAL_LAST / FINAL_FIRST) ** (1 / 21)
-    assert colours[0] == pytest.approx(FINAL_FIRST) and colours[-1] == pytest.approx(FINAL_LAST / fading)
-    np.testing.assert_allclose(colours[1:] / colours[:-1], fading)
+    colours = np.array([rates.rgb for rates, _ in rasterizer.asked]) / config.rgb_rate / FINAL_COLORS
+    falling = np.cos(np.linspace(0, np.pi, 22))[:21]
+    np.testing.assert_allclose(colours, FINAL_LAST + (FINAL_FIRST - FINAL_LAST) * (1 + falling) / 2)
     assert rasterizer.asked[0][0].means == pytest.approx(FINAL_MEANS * FINAL_FIRST * config.means_rate)
 
 

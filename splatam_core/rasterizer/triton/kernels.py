@@ -539,12 +539,13 @@ def fit_tile(
 
 @triton.jit
 def _adam(value, moment, gradient, rate, left_1, left_2, seen):
-    """Takes one step of one parameter (Kingma and Ba 2015). Returns its new value."""
+    """Takes one step of one parameter (Adam with Nesterov's momentum, Dozat 2016). Returns its new value."""
     first = BETA_1 * tl.load(moment, mask=seen, other=0.0) + (1.0 - BETA_1) * gradient
     second = BETA_2 * tl.load(moment + 8, mask=seen, other=0.0) + (1.0 - BETA_2) * gradient * gradient
     tl.store(moment, first, mask=seen)
     tl.store(moment + 8, second, mask=seen)
-    moved = tl.load(value, mask=seen, other=0.0) - rate * (first / left_1) / (tl.sqrt(second / left_2) + EPSILON)
+    ahead = (BETA_1 * first + (1.0 - BETA_1) * gradient) / left_1
+    moved = tl.load(value, mask=seen, other=0.0) - rate * ahead / (tl.sqrt(second / left_2) + EPSILON)
     tl.store(value, moved, mask=seen)
     return moved
 

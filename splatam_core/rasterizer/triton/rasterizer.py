@@ -234,9 +234,9 @@ def _fit_tiles(view: View, target: Target, gradients: Tensor) -> Tensor:
 
 
 def _corrections() -> Tensor:
-    """Returns [256, 2] the bias corrections of Adam's two moments by number of steps."""
+    """Returns [256, 2] the bias corrections of Adam's two moments by number of steps; of the first as it is one step ahead."""
     steps = torch.arange(_MAX_STEPS + 1, dtype=torch.float64)
-    return torch.stack([1 - BETA_1**steps, 1 - FIT_BETA_2**steps], dim=1).float()
+    return torch.stack([1 - BETA_1 ** (steps + 1), 1 - FIT_BETA_2**steps], dim=1).float()
 
 
 def _check(gaussians: Gaussians, T_cam_world: Tensor) -> None:
