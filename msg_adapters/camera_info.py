@@ -101,6 +101,11 @@ def _intrinsics(name: str, matrix: Sequence[float], columns: int) -> list[float]
             f'CameraInfo {name} = {values}: focal lengths must be positive and all values finite; '
             'the camera is not calibrated, or its driver does not publish the calibration'
         )
+    if any(values[index] for index in (columns, 2 * columns, 2 * columns + 1)):
+        raise MessageError(
+            f'CameraInfo {name} = {values}: expected fx 0 cx, 0 fy cy, 0 0 1, row by row; it is given column by column, or its '
+            'pixels are not square'
+        )
     if max(fx, fy, abs(cx), abs(cy)) > _MAX_PIXELS:
         raise MessageError(
             f'CameraInfo {name} = {values}: focal lengths and principal point are in pixels, at most {_MAX_PIXELS:g}; '

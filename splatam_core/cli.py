@@ -23,7 +23,7 @@ from splatam_core.commands import (
     view,
 )
 from splatam_core.commands.shared import EXIT_ERROR, EXIT_INTERRUPTED
-from splatam_core.errors import SplatamError, one_line
+from splatam_core.errors import SplatamError, one_line, printable
 from splatam_core.interruption import on_stop_signals
 from splatam_core.output import unfailing_output
 
@@ -80,14 +80,15 @@ def _main(args: argparse.Namespace) -> int:
 
 
 class _Once:
-    """Lets each warning pass once: a recording is opened several times by some commands."""
+    """Lets each warning pass once, as one line: a recording is opened several times by some commands."""
 
     def __init__(self) -> None:
         self._said: set[str] = set()
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Returns False for a message that was said already."""
-        text = record.getMessage()
+        text = printable(record.getMessage())
+        record.msg, record.args = text, ()
         is_new = text not in self._said
         self._said.add(text)
         return is_new

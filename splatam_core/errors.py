@@ -11,8 +11,7 @@ class SplatamError(Exception):
 
     def __init__(self, text: str = '') -> None:
         """Make one printable line of the text; the middle of a very long one is left out."""
-        line = ''.join(character if character.isprintable() else ' ' for character in text)
-        super().__init__(line if len(line) <= LONGEST else f'{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}')
+        super().__init__(printable(text))
 
 
 class ConfigError(SplatamError):
@@ -65,6 +64,12 @@ class WeightsError(SplatamError):
 
 class CheckpointError(SplatamError):
     """A checkpoint that is missing, damaged, or of another run."""
+
+
+def printable(text: str) -> str:
+    """Returns one printable line: names in messages and files may hold anything. The middle of a very long one is left out."""
+    line = ''.join(character if character.isprintable() else ' ' for character in text)
+    return line if len(line) <= LONGEST else f'{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}'
 
 
 def one_line(error: Exception | str) -> str:

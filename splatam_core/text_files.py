@@ -102,7 +102,7 @@ def parse_yaml(text: str) -> Any:
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """Reads neither aliases nor deeply nested values."""
+    """Reads neither aliases, nor deeply nested values, nor a key that is there twice."""
 
     _depth = 0
 
@@ -119,6 +119,14 @@ class _PlainLoader(yaml.SafeLoader):
             return super().compose_node(parent, index)
         finally:
             self._depth -= 1
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        """See ``yaml.constructor.BaseConstructor``."""
+        values = super().construct_mapping(node, deep)
+        names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise yaml.YAMLError(f"the key '{twice[0]}' is there twice, line {node.start_mark.line + 1} and below; keep one")
+        return values
 
     def construct_yaml_int(self, node: Any) -> int:
         """See ``yaml.constructor.SafeConstructor``."""

@@ -8,7 +8,7 @@ import traceback
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 from msg_adapters.errors import MessageError
-from splatam_core.errors import SplatamError, one_line
+from splatam_core.errors import SplatamError, one_line, printable
 
 
 class ThrottledWarnings:
@@ -34,7 +34,7 @@ class ThrottledWarnings:
             return
         self._logged_s[kind] = now_s
         suppressed = self._num_suppressed.pop(kind, 0)
-        self._logger.warning(text + (f' (and {suppressed} more of this kind before)' if suppressed else ''))
+        self._logger.warning(printable(text) + (f' (and {suppressed} more of this kind before)' if suppressed else ''))
 
     def warn_of(self, kind: str, what: str, error: Exception) -> None:
         """Log a warning about an error. One that the user cannot cause also logs its traceback, at level debug.

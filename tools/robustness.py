@@ -21,6 +21,7 @@ import yaml
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / 'docs' / 'robustness.md'
 DATA = ROOT / 'test' / 'field' / 'robustness.yaml'
+FAILED_BEFORE = ROOT / 'test' / 'field' / 'failed_before.txt'
 SECTION = re.compile(r'(<!-- generated: (\w+) -->\n).*?(<!-- end -->)', re.DOTALL)
 COLUMNS = {
     'inputs': {'input': 'what people bring', 'was': 'in 0.1.0', 'now': 'now'},
@@ -49,7 +50,14 @@ def table(name: str, rows: Iterable[Row]) -> str:
 
 
 def _shown(row: Row) -> str:
-    return '<br>'.join([*(f'`{test}`' for test in row.get('tests', ())), *filter(None, [row.get('not_tested')])])
+    tests = (f'`{test}`{" †" if test in _failed_before() else ""}' for test in row.get('tests', ()))
+    return '<br>'.join([*tests, *filter(None, [row.get('not_tested')])])
+
+
+@cache
+def _failed_before() -> frozenset[str]:
+    """Returns the tests that were run with the packages of 0.1.0, and fail there."""
+    return frozenset(line for line in FAILED_BEFORE.read_text().splitlines() if not line.startswith('#'))
 
 
 def faults(name: str, row: Row) -> list[str]:

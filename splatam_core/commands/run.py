@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import signal
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING
 
 from splatam_core.commands.evaluate import print_summary, score_own_run
+from splatam_core.commands.frame_notes import FrameNotes
 from splatam_core.commands.shared import (
     EXIT_INTERRUPTED,
     Command,
@@ -76,6 +77,11 @@ def run(args: argparse.Namespace) -> int:
     metrics = outcome.metrics
     if metrics.frames == 0:
         raise RunFolderError(f'{job.sequence.name}: none of its {len(job.sequence)} frames could be used; see above')
+    if metrics.num_gaussians == 0:
+        say(
+            f'nothing was mapped, all {metrics.frames} frames are lost, the last one because {job.notes.last_reason}; are the unit '
+            'of depth (depth_scale in a camera.yaml), depth.min_m and depth.max_m right?'
+        )
     if not args.no_evaluate:
         metrics = score_own_run(read_run(path), job.ground_truth, job.sequence)
     print_summary(metrics, path, left_out=len(job.sequence) - metrics.frames)
@@ -93,6 +99,7 @@ class _Job:
         folder: holds the frames before that frame.
         checkpoints: saves checkpoints.
         ground_truth: the true poses, to score the run; None if they are unknown.
+        notes: say why frames are skipped or lost.
     """
 
     sequence: FrameSequence
@@ -101,6 +108,7 @@ class _Job:
     folder: RunFolder
     checkpoints: CheckpointWriter
     ground_truth: Trajectory | None
+    notes: FrameNotes = field(default_factory=FrameNotes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -254,6 +262,7 @@ def _process_and_save(job: _Job) -> _Outcome:
     try:
         with job.folder, _StopRequest() as stop:
             failure = _process(job, stop)
+            job.notes.say_how_many_more()
             is_whole = failure is None and not stop.requested
             if not is_whole:
                 job.checkpoints.at_stop(job.slam)
@@ -269,6 +278,8 @@ def _process(job: _Job, stop: _StopRequest) -> SplatamError | None:
     """Processes frame after frame, to the end or to a stop request. Returns the error that ended the recording, if any."""
     from tqdm import tqdm
 
+    from splatam_core.types import Status
+
     counts = dict.fromkeys(('tracked', 'uncertain', 'lost'), 0)
     length = len(job.sequence)
     with tqdm(range(job.first, length), initial=job.first, total=length, unit='frame', dynamic_ncols=True) as bar:
@@ -281,12 +292,14 @@ def _process(job: _Job, stop: _StopRequest) -> SplatamError | None:
                 decoded_s = time.perf_counter()
                 result = job.slam.process(frame)
             except FrameError as error:
-                say(f'frame {index} is skipped: {error}')
+                job.notes.skipped(index, str(error))
                 continue
             except SplatamError as error:  # the recording ends here, or a view is too large: what was mapped is saved
                 return error
             job.folder.append(frame, result, time.perf_counter() - decoded_s, decoded_s - started_s)
             job.checkpoints.after_frame(index, frame, job.slam)
+            if result.status is Status.LOST:
+                job.notes.lost(index, result.reason)
             counts['tracked' if result.status.is_trusted else result.status.value] += 1
             bar.set_postfix(counts | {'gaussians': result.num_gaussians}, refresh=False)
     return None

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, TypeVar
 
 from splatam_core.config import DEVICES, computed_on
-from splatam_core.errors import SplatamError
+from splatam_core.errors import SplatamError, printable
 
 if TYPE_CHECKING:
     from splatam_core.config import SlamConfig
@@ -284,4 +284,4 @@ def say(text: str) -> None:
     """Prints a message to the user on stderr, above a progress bar."""
     from tqdm import tqdm
 
-    tqdm.write(f'splatam: {text}', file=sys.stderr)
+    tqdm.write(f'splatam: {printable(text)}', file=sys.stderr)

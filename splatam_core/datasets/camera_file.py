@@ -12,6 +12,9 @@
     distortion: [0.1, -0.2, 0, 0, 0]    # optional: coefficients in OpenCV's order
     depth_scale: 1000                   # optional: stored depth counts per metre
     pose_axes: opencv                   # optional, plain folders only: or opengl
+
+The file that ROS's camera_calibration writes (``image_width``, ``camera_matrix``, ``distortion_coefficients``) is read, too;
+``depth_scale`` and ``pose_axes`` may be added to it.
 """
 
 from __future__ import annotations
@@ -30,6 +33,11 @@ from splatam_core.text_files import read_yaml
 NAME = 'camera.yaml'
 REQUIRED = frozenset({'width', 'height', 'fx', 'fy', 'cx', 'cy'})
 OPTIONAL = frozenset({'distortion_model', 'distortion', 'depth_scale', 'pose_axes'})
+ROS_KEYS = {
+    'image_width': 'width', 'image_height': 'height', 'camera_matrix': '', 'distortion_coefficients': '', 'camera_name': '',
+    'rectification_matrix': '', 'projection_matrix': '',
+}  # fmt: skip
+"""Keys of a calibration of ROS, and ours for those that are one number."""
 POSE_AXES = ('opencv', 'opengl')
 DEPTH_SCALES = (1e-3, 1e9)
 
@@ -107,6 +115,8 @@ def read_camera_file(path: Path) -> CameraFile:
     values = read_yaml(path, CameraError)
     if not isinstance(values, dict):
         raise CameraError(f'{path}: expected a mapping with width, height, fx, fy, cx, cy')
+    if 'camera_matrix' in values:
+        values = _of_ros(values)
     if missing := REQUIRED - values.keys():
         raise CameraError(f'{path}: missing {", ".join(sorted(missing))}')
     if unknown := values.keys() - REQUIRED - OPTIONAL:
@@ -115,6 +125,21 @@ def read_camera_file(path: Path) -> CameraFile:
         return _parse(values)
     except (TypeError, ValueError, OverflowError, CameraError) as error:
         raise CameraError(f'{path}: {error}') from None
+
+
+def _of_ros(values: dict[Any, Any]) -> dict[Any, Any]:
+    """Returns the keys of this format for those of a calibration of ROS. A key whose value has another form is left out."""
+    ours = {key: value for key, value in values.items() if key not in ROS_KEYS}
+    ours |= {ours_key: values[key] for key, ours_key in ROS_KEYS.items() if ours_key and key in values}
+    matrix, coefficients = (_data(values.get(key)) for key in ('camera_matrix', 'distortion_coefficients'))
+    if len(matrix) == 9:
+        ours |= dict(zip(('fx', 'cx', 'fy', 'cy'), (matrix[index] for index in (0, 2, 4, 5)), strict=True))
+    return ours | ({'distortion': coefficients} if coefficients else {})
+
+
+def _data(matrix: Any) -> list[Any]:
+    data = matrix.get('data') if isinstance(matrix, dict) else None
+    return data if isinstance(data, list) else []
 
 
 def say_assumed(folder: Path, what: str) -> None:

@@ -53,7 +53,7 @@ def write_bag(
         with _complete_or_absent(path) as folder:
             write(sequence, folder, storage, compressed, progress(indices) if progress else indices)
     except (OSError, sqlite3.Error) as error:
-        raise DatasetError(f'{path}: cannot be written: {error}') from None
+        raise DatasetError(f'{path}: cannot be written: {getattr(error, "strerror", None) or error}') from None
 
 
 @contextmanager

@@ -97,7 +97,8 @@ def _present(folder: Path, names: Iterable[str]) -> str | None:
 
 def _by_number(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     """Returns files by the last number in their names, which must be unique."""
-    paths = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in suffixes] if folder.is_dir() else []
+    present = sorted(folder.iterdir()) if folder.is_dir() else []
+    paths = [path for path in present if path.suffix.lower() in suffixes and not path.name.startswith('.')]  # of macOS: ._1.png
     found: dict[int, Path] = {}
     for path in paths:
         match = re.fullmatch(LAST_NUMBER, path.stem)

@@ -25,11 +25,12 @@ from __future__ import annotations
 import heapq
 import logging
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +43,7 @@ from splatam_core.datasets.pairs import DepthFormat, ImagePair, ImagePairs
 from splatam_core.errors import DatasetError
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 from splatam_core.geometry.stamps import guess_unit, stamp_number, stamp_text
-from splatam_core.geometry.trajectory import read_ground_truth, warn_of_unit
+from splatam_core.geometry.trajectory import read_ground_truth, too_many, warn_of_unit
 from splatam_core.text_files import read_text
 
 DEFAULT_DEPTH_SCALE = 5000.0
@@ -65,6 +66,7 @@ KNOWN_CAMERAS = {
 
 
 _log = logging.getLogger(__name__)
+Row = TypeVar('Row')
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,51 +222,73 @@ def _associated(folder: Path, path: Path, max_interval_ns: int | None) -> list[I
         path: the list.
         max_interval_ns: pairs further apart are left out, with a warning; None = none is.
     """
-    rows = list(_rows(path, 'stamp path stamp path', lambda line: _fields(line.split(), 4)))
+    rows = _rows(path, 'stamp path stamp path', 4)
     if not rows:
         raise DatasetError(f'{path}: no pair in it; expected lines with stamp, path of colour, stamp, path of depth')
     first, second = _listed(path, [row[:2] for row in rows]), _listed(path, [row[2:] for row in rows])
     says_depth = [sum('depth' in row.name.lower() for row in side) for side in (first, second)]
     color, depth = (second, first) if says_depth[0] > says_depth[1] else (first, second)
-    _check_increasing(path, color)
-    pairs = list(zip(color, depth, strict=True))
+    pairs = _in_order(path, list(zip(color, depth, strict=True)), lambda pair: pair[0].stamp_ns)
     near = [pair for pair in pairs if max_interval_ns is None or abs(pair[0].stamp_ns - pair[1].stamp_ns) <= max_interval_ns]
     if max_interval_ns is not None and len(near) < len(pairs):
         apart = f'{path}: {len(pairs) - len(near)} of {len(pairs)} pairs are more than {max_interval_ns / 1e6:g} ms apart'
         if not near:
-            raise DatasetError(f'{apart}{base.nearest_depth(_stamps_ns(color), _stamps_ns(depth))}')
+            stamps_ns = (_stamps_ns([pair[side] for pair in pairs]) for side in (0, 1))
+            raise DatasetError(f'{apart}{base.nearest_depth(*stamps_ns)}')
         _log.warning('%s and left out', apart)
     return [ImagePair(c.stamp_ns, files.listed(folder, c.name), files.listed(folder, d.name)) for c, d in near]
 
 
 def _read_list(path: Path) -> list[_Listed]:
-    """Returns the images of a list with increasing stamps."""
-    rows = _listed(path, list(_rows(path, 'stamp path', lambda line: _fields(line.split(maxsplit=1), 2))))
-    _check_increasing(path, rows)
-    return rows
+    """Returns the images of a list in the order of their stamps."""
+    rows = _rows(path, 'stamp path', 2)
+    if not rows:
+        raise DatasetError(f'{path}: no image in it; expected lines with stamp and path')
+    return _in_order(path, _listed(path, rows), lambda row: row.stamp_ns)
 
 
-def _rows(path: Path, expected: str, parse: Callable[[str], list[str]]) -> Iterable[list[str]]:
-    """Yields the fields of each line that is no comment."""
-    for number, line in enumerate(read_text(path, DatasetError).splitlines(), 1):
-        if line.strip() and not line.lstrip().startswith('#'):
-            try:
-                yield parse(line)
-            except ValueError:
-                raise DatasetError(f"{path}:{number}: expected '{expected}', got '{line.strip()[:200]}'") from None
+def _rows(path: Path, expected: str, count: int) -> list[list[str]]:
+    """Returns the fields of each line that is no comment: stamps and paths in turn. Single other lines are left out, and said.
 
-
-def _fields(fields: list[str], count: int) -> list[str]:
-    """Returns stamps and paths in turn.
+    Args:
+        path: the list.
+        expected: the fields of a line, for people.
+        count: their number.
 
     Raises:
-        ValueError: there are more or fewer, or a stamp is no number.
+        DatasetError: more than a tenth of the lines hold something else.
     """
-    if len(fields) != count:
-        raise ValueError
-    for stamp in fields[::2]:
-        stamp_number(stamp)
-    return [field.strip() for field in fields]
+    lines = [(number, line.strip()) for number, line in enumerate(read_text(path, DatasetError).splitlines(), 1) if line.strip()]
+    lines = [(number, line) for number, line in lines if not line.startswith('#')]
+    rows = [_fields(line, count) for _, line in lines]
+    if len(rows) > 1 and rows[0] is None and not any(map(str.isdigit, lines[0][1])):  # a heading
+        lines, rows = lines[1:], rows[1:]
+    faults = [
+        f"{path}:{number}: expected '{expected}', got '{line[:200]}'"
+        for (number, line), row in zip(lines, rows, strict=True) if row is None
+    ]  # fmt: skip
+    if too_many(len(faults), len(rows)):
+        raise DatasetError(faults[0])
+    if faults:
+        _log.warning('%s; of %d lines %d are left out', faults[0], len(rows), len(faults))
+    return [row for row in rows if row is not None]
+
+
+def _fields(line: str, count: int) -> list[str] | None:
+    """Returns stamps and paths in turn; None if there are more or fewer, or a stamp is no number."""
+    for separator in (None, ',', ';'):
+        fields = [field.strip().strip('"\'').strip() for field in line.split(separator, count - 1)]
+        if len(fields) == count and all(map(_is_stamp, fields[::2])) and all(fields):
+            return fields
+    return None
+
+
+def _is_stamp(text: str) -> bool:
+    try:
+        stamp_number(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _listed(path: Path, rows: list[list[str]]) -> list[_Listed]:
@@ -277,12 +301,25 @@ def _listed(path: Path, rows: list[list[str]]) -> list[_Listed]:
         raise DatasetError(f'{path}: {error}') from None
 
 
-def _check_increasing(path: Path, rows: list[_Listed]) -> None:
-    for before, after in pairwise(rows):
-        if after.stamp_ns <= before.stamp_ns:
-            raise DatasetError(
-                f'{path}: stamps must increase, but {stamp_text(after.stamp_ns)} follows {stamp_text(before.stamp_ns)}'
-            )
+def _in_order(path: Path, rows: list[Row], stamp_ns: Callable[[Row], int]) -> list[Row]:
+    """Returns the rows in the order of their stamps; of equal stamps the first row. What is changed is said.
+
+    Raises:
+        DatasetError: more than a tenth of the stamps are there already.
+    """
+    ordered = sorted(rows, key=stamp_ns)
+    kept = ordered[:1] + [row for before, row in pairwise(ordered) if stamp_ns(row) > stamp_ns(before)]
+    twice = len(rows) - len(kept)
+    if too_many(twice, len(rows)):
+        raise DatasetError(
+            f'{path}: stamps must differ, but {twice} of {len(rows)} are there already, the first '
+            f'{stamp_text(stamp_ns(ordered[0]))}; are they whole seconds?'
+        )
+    changes = [f'{twice} of {len(rows)} lines have a stamp that is there already and are left out'] if twice else []
+    changes += ['the lines are not in the order of their stamps, and are sorted'] if ordered != rows else []
+    if changes:
+        _log.warning('%s: %s', path, '; '.join(changes))
+    return kept
 
 
 def _recognises(source: str) -> bool:

@@ -28,6 +28,7 @@ from splatam_core.mapping.posed import PosedView
 from splatam_core.maps.ply import write_ply
 from splatam_core.rasterizer import Gaussians
 from splatam_core.runs import provenance
+from splatam_core.runs.folder_lock import FolderLock
 from splatam_core.runs.frame_records import CSV_HEADER, LOST, FrameRecord, complete_lines, read_poses, trajectory_line
 from splatam_core.runs.layout import (
     CONFIG,
@@ -82,15 +83,22 @@ class RunFolder:
     Use it as a context manager, or call ``close``. It is not thread-safe.
     """
 
-    def __init__(self, path: Path, statistics: FrameStatistics | None = None, *, has_camera: bool = False) -> None:
+    def __init__(
+        self, path: Path, statistics: FrameStatistics | None = None, *, has_camera: bool = False, lock: FolderLock | None = None
+    ) -> None:
         """Opens the files of an existing folder to append to them.
 
         Args:
             path: the folder.
             statistics: of the frames that are in it already; None = it has none.
             has_camera: True if ``run.json`` names their camera.
+            lock: of the folder; None locks it.
+
+        Raises:
+            RunFolderError: another run is being written there.
         """
         self.path = path
+        self._lock: FolderLock | None = lock or FolderLock(path)
         self._statistics = statistics or FrameStatistics()
         self._has_camera = has_camera
         self._camera: PinholeCamera | None = None
@@ -113,10 +121,14 @@ class RunFolder:
         backend = str(choose_backend(config))
         try:
             if overwrite and path.is_dir() and any(path.iterdir()):
+                lock = FolderLock(path)
                 remove_run(path)
-            check_is_free(path)
-            path.mkdir(parents=True, exist_ok=True)
-            return cls._begin(path, config, run_information(description) | {'backend': backend})
+                check_is_free(path)
+            else:
+                check_is_free(path)
+                path.mkdir(parents=True, exist_ok=True)
+                lock = FolderLock(path)
+            return cls._begin(path, config, run_information(description) | {'backend': backend}, lock)
         except (OSError, ValueError) as error:  # ValueError: a NUL in the path
             raise RunFolderError(f'{path}: cannot be written: {why_not(error)}; choose another folder') from None
 
@@ -132,15 +144,17 @@ class RunFolder:
         Raises:
             RunFolderError: that frame is not in the folder; nothing is changed then.
         """
+        with read_errors(path):
+            lock = FolderLock(path)
         _trim(path, num_frames, last_stamp_ns)
         run = read_run(path)
-        return cls(path, FrameStatistics(run.frames), has_camera=run.camera is not None)
+        return cls(path, FrameStatistics(run.frames), has_camera=run.camera is not None, lock=lock)
 
     @classmethod
-    def _begin(cls, path: Path, config: SlamConfig, information: dict[str, Any]) -> RunFolder:
+    def _begin(cls, path: Path, config: SlamConfig, information: dict[str, Any], lock: FolderLock) -> RunFolder:
         replace_text(path / CONFIG, to_yaml(config))
         replace_text(path / RUN, as_json(information))
-        folder = cls(path)
+        folder = cls(path, lock=lock)
         folder._frames.write(csv_row(CSV_HEADER))
         return folder
 
@@ -175,8 +189,9 @@ class RunFolder:
             with prepared({self.path / name: text for name, text in texts.items()}) as put_in_place:
                 self._move_to_previous()
                 put_in_place()
+            lock, self._lock = self._lock, None
             self.close()
-            return RunFolder(self.path)
+            return RunFolder(self.path, lock=lock)
         except OSError as error:
             raise RunFolderError(f'{self.path}: a new run cannot begin: {why_not(error)}') from None
 
@@ -310,9 +325,11 @@ class RunFolder:
         Raises:
             OSError: the last lines do not fit on the disk; the files are closed nevertheless.
         """
-        with ExitStack() as both:
-            both.callback(self._frames.close)
-            both.callback(self._trajectory.close)
+        with ExitStack() as each:
+            if self._lock is not None:
+                each.callback(self._lock.release)
+            each.callback(self._frames.close)
+            each.callback(self._trajectory.close)
 
     def __enter__(self) -> RunFolder:
         return self

@@ -13,7 +13,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.logging import get_logger
 
-from splatam_core.errors import SplatamError
+from splatam_core.errors import SplatamError, printable
 from splatam_core.output import unfailing_output
 from splatam_core.settings import Setting
 from splatam_ros.node.node import SplatamNode
@@ -36,12 +36,13 @@ class RosLog(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Log a record at the nearest ROS severity."""
+        text = printable(record.getMessage())
         if record.levelno >= logging.ERROR:
-            self._logger.error(record.getMessage())
+            self._logger.error(text)
         elif record.levelno >= logging.WARNING:
-            self._logger.warning(record.getMessage())
+            self._logger.warning(text)
         else:
-            self._logger.info(record.getMessage())
+            self._logger.info(text)
 
 
 def run(for_ros: Sequence[str], stop: StopRequest) -> int:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 from splatam_core.config import SlamConfig
-from splatam_core.errors import ConfigError, MapFileError, SplatamError
+from splatam_core.errors import ConfigError, MapFileError, SplatamError, printable
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.maps.ply import read_ply
 from splatam_core.runs.layout import MAP, MAP_KEYFRAMES
@@ -25,6 +25,7 @@ from splatam_core.types import FrameResult, RgbdFrame, Status
 from splatam_ros.frames.buffer import TransformError
 from splatam_ros.frames.rep105 import Located, parse_pose
 from splatam_ros.frames.robot_frames import RobotFrames
+from splatam_ros.node.attempt import attempt
 from splatam_ros.node.outputs import Outputs
 from splatam_ros.node.parameters import NodeOptions, as_path
 from splatam_ros.node.run_recorder import RunRecorder
@@ -191,8 +192,11 @@ class MapLifecycle:
                 'initialpose if it is elsewhere'
             )
         slam.load(gaussians, T_world_cam, saved)
+        is_own = self._recorder.holds(path)
         kept = self._recorder.start_over(slam, is_saved=True)
         self._begin_world()
+        if is_own:  # what was loaded has been moved or replaced
+            attempt(self._logger, 'saving the loaded map again', lambda: self._recorder.save(slam))
         message = f'loaded {len(gaussians)} Gaussians and {len(saved.keyframes)} keyframes from {path}: {start}{kept}'
         self._logger.info(message)
         return message
@@ -205,9 +209,8 @@ class MapLifecycle:
             T_map_body: [4, 4] pose of the base, or of the camera in body axes if there is no base.
         """
         if frame_id != self._options.map_frame:
-            self._logger.warning(
-                f"initialpose is refused: it is in the frame '{frame_id}', and must be in map_frame, '{self._options.map_frame}'"
-            )
+            text = f"it is in the frame '{frame_id}', and must be in map_frame, '{self._options.map_frame}'"
+            self._logger.warning(f'initialpose is refused: {printable(text)}')
             return
         self._told = T_map_body
 

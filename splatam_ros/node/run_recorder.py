@@ -22,7 +22,7 @@ from splatam_core.runs.writer import RunFolder
 from splatam_core.slam import Slam
 from splatam_core.types import FrameResult, RgbdFrame
 from splatam_ros.node.attempt import why
-from splatam_ros.node.parameters import NodeOptions
+from splatam_ros.node.parameters import NodeOptions, as_path
 from splatam_ros.throttled_warnings import ThrottledWarnings
 
 PROGRAM = 'splatam_node'
@@ -74,6 +74,7 @@ class RunRecorder:
 
         Raises:
             RunFolderError: the folder cannot be created, or is in use.
+            ConfigError: it would be overwritten, and holds the map to load.
         """
         self._options = options
         self._description = RunDescription(PROGRAM, options.preset)
@@ -83,12 +84,17 @@ class RunRecorder:
         self._waiting: Waiting | None = None
         self._retry_s = 0.0
         if options.folder is not None:
+            _check_keeps_the_map(options, options.folder)
             self._folder = RunFolder.create(options.folder, config, self._description, overwrite=options.overwrite)
 
     @property
     def path(self) -> Path | None:
         """The folder in which frames are recorded; None if they are not."""
         return self._folder.path if self._folder else None
+
+    def holds(self, path: Path) -> bool:
+        """True if a file is in the run's folder, so that a reset moves or replaces it."""
+        return self._folder is not None and _is_in(path, self._folder.path)
 
     def use(self, options: NodeOptions) -> None:
         """Apply changed options; the next save uses the new ``save_path``."""
@@ -226,3 +232,23 @@ class RunRecorder:
         """Close the folder's files."""
         if self._folder is not None:
             self._folder.close()
+
+
+def _check_keeps_the_map(options: NodeOptions, folder: Path) -> None:
+    """Checks that overwriting a run does not remove the map that is to be loaded.
+
+    Raises:
+        ConfigError: it would.
+    """
+    if options.overwrite and options.load_path and _is_in(as_path('load_path', options.load_path), folder):
+        raise ConfigError(
+            f'load_path = {options.load_path} is in {folder}, and overwrite would remove it before it is loaded: save to another '
+            'folder'
+        )
+
+
+def _is_in(path: Path, folder: Path) -> bool:
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # a loop of links: it cannot be loaded either
+        return False

@@ -202,3 +202,9 @@ def test_the_camera_of_rectified_images_is_p(info):
 def test_rectified_images_without_p_are_an_error(info):
     with pytest.raises(MessageError, match='CameraInfo P .* focal lengths must be positive'):
         parameters(info(p=[0.0] * 12), is_rectified=True)
+
+
+def test_a_matrix_given_column_by_column_is_refused(info):
+    """Its principal point would be read as 0, in silence."""
+    with pytest.raises(MessageError, match='row by row; it is given column by column'):
+        parameters(info(k=np.reshape(info().k, (3, 3)).T.reshape(-1).copy()))

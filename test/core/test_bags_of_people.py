@@ -191,9 +191,26 @@ def color_of_squares(stamp_ns):
 
 
 def test_a_large_change_is_another_camera(tmp_path):
-    bag = write(tmp_path / 'bag', scene(make_info=lambda ns: with_focal_length(30.0 if ns == SECOND else 33.0, ns)))
-    with pytest.raises(DatasetError, match=r'the camera changes at 1\.033000000 s'):
+    bag = write(tmp_path / 'bag', scene(make_info=lambda ns: with_focal_length(30.0 if ns <= SECOND + PERIOD else 33.0, ns)))
+    with pytest.raises(DatasetError, match=r'the camera changes at 1\.066000000 s'):
         open_sequence(str(bag))
+
+
+@pytest.mark.parametrize('stray', [0, 2, 5])
+@pytest.mark.parametrize('changes', [{'fx': 60.0}, {'size': (64, 48)}])
+def test_one_camera_info_of_another_camera_costs_itself(tmp_path, caplog, stray, changes):
+    """As for the node, which waits for a second message that says the same."""
+
+    def make_info(ns):
+        message = info(ns)
+        if ns == SECOND + stray * PERIOD:
+            message.k[0] = changes.get('fx', message.k[0])
+            message.width, message.height = changes.get('size', (message.width, message.height))
+        return message
+
+    read = open_sequence(str(write(tmp_path / 'bag', scene(count=6, make_info=make_info))))
+    assert {read[i].camera.fx for i in range(6)} == {30.0} and len(read) == 6
+    assert f'1 messages on {INFO_TOPIC} state another camera than those before and after them, and are left out' in caplog.text
 
 
 # --- stamps and pairs ---

@@ -19,6 +19,7 @@ import pytest
 from processes import Process, run_code
 
 from splatam_core.cli import COMMANDS, main
+from splatam_core.commands.frame_notes import FrameNotes
 from splatam_core.commands.shared import at_width
 from splatam_core.config import load_config
 from splatam_core.datasets.registry import open_sequence
@@ -238,6 +239,34 @@ def test_a_frame_of_another_size_is_left_out(tmp_path: Path, capsys: pytest.Capt
     assert splatam('run', tmp_path / 'tum', *SETTINGS, '--no-evaluate', '--out', tmp_path / 'run') == 0
     assert 'frame 1 is skipped: ' in capsys.readouterr().err
     assert metrics(tmp_path / 'run')['frames'] == FRAMES - 1
+
+
+@pytest.mark.parametrize(
+    ('scale', 'why'),
+    [('1', 'no pixel has a usable depth reading'), ('100000000', 'no pixel has a usable depth reading')],
+)  # fmt: skip
+def test_a_run_that_maps_nothing_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str], scale: str, why: str) -> None:
+    """Such as depth in another unit: every frame is lost."""
+    write_tum(tmp_path / 'tum')
+    camera = tmp_path / 'tum' / 'camera.yaml'
+    camera.write_text(camera.read_text().replace('5000', scale))
+    assert splatam('run', tmp_path / 'tum', *SETTINGS, '--no-evaluate', '--out', tmp_path / 'run') == 0
+    error = capsys.readouterr().err
+    assert f'frame 0 is lost: the map cannot start: {why}' in error
+    assert re.search(rf'splatam: nothing was mapped, all {FRAMES} frames are lost, .*{why}; .*depth_scale', error)
+    assert metrics(tmp_path / 'run')['lost'] == FRAMES
+
+
+def test_the_first_few_of_many_frames_alike_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    notes = FrameNotes()
+    for index in range(1000):
+        notes.lost(index, f'only {index}% of the view is mapped')
+        notes.skipped(index, f'{index}.png: cannot be read')
+    notes.lost(1000, 'another reason')
+    notes.say_how_many_more()
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 3 + 3 + 1 + 2 and 'splatam: frame 1000 is lost: another reason' in lines
+    assert lines[-2:] == ['splatam: 997 more frames are skipped like these', 'splatam: 997 more frames are lost like these']
 
 
 @pytest.mark.slow

@@ -187,6 +187,18 @@ def test_resized_cropped_and_thinned(source, layout):
 # --- recognition and errors ---
 
 
+def test_hidden_files_of_other_systems_change_nothing(source, layout):
+    """macOS puts ._NAME beside each file on a disk of another kind."""
+    if layout.format == 'rosbag':
+        pytest.skip('the files of a bag are in its metadata')
+    expected = len(read(source, layout))
+    for path in [path for path in source.rglob('*') if path.is_file()]:
+        path.with_name('._' + path.name).write_bytes(b'\0\5\x16\7')
+        (path.parent / '.DS_Store').write_bytes(b'\0')
+    sequence = read(source, layout)
+    assert len([sequence[index] for index in range(len(sequence))]) == expected
+
+
 def test_recognised_by_one_reader_only(source, layout):
     fitting = [reader for name in READERS if (reader := _reader(name)).recognises(str(source))]
     certain = [reader.name for reader in fitting if not reader.is_last_resort] or [reader.name for reader in fitting]

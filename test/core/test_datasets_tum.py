@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -9,9 +10,11 @@ import numpy as np
 import pytest
 
 from splatam_core.datasets import tum
+from splatam_core.datasets.camera_file import read_camera_file
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.datasets.tum import KNOWN_CAMERAS, associate
 from splatam_core.errors import CameraError, DatasetError, FrameError
+from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 
 CAMERA_YAML = 'width: 64\nheight: 48\nfx: 50\nfy: 51\ncx: 31.5\ncy: 23.5\n'
 BASE = 1305031000
@@ -128,12 +131,58 @@ def test_broken_camera_yaml(tmp_path):
         tum.read(write_tum(tmp_path, [1.0], [1.0], camera='width: 64\nheight: 48\nfx: 50\n'))
 
 
+ROS_CALIBRATION = """
+image_width: 64
+image_height: 48
+camera_name: narrow_stereo
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [50., 0., 31.5, 0., 51., 23.5, 0., 0., 1.]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [0.1, -0.2, 0., 0., 0.]
+rectification_matrix: {rows: 3, cols: 3, data: [1., 0., 0., 0., 1., 0., 0., 0., 1.]}
+projection_matrix: {rows: 3, cols: 4, data: [50., 0., 31.5, 0., 0., 51., 23.5, 0., 0., 0., 1., 0.]}
+"""
+
+
+def test_a_calibration_of_ros_is_read(tmp_path):
+    path = tmp_path / 'camera.yaml'
+    path.write_text(ROS_CALIBRATION + 'depth_scale: 1000\n')
+    read = read_camera_file(path)
+    assert read.calibration == CameraCalibration(PinholeCamera(64, 48, 50, 51, 31.5, 23.5), 'plumb_bob', (0.1, -0.2, 0.0, 0.0, 0.0))
+    assert read.depth_scale == 1000
+
+
+@pytest.mark.parametrize(
+    ('before', 'after', 'message'),
+    [
+        ('50., 0., 31.5, 0., 51., 23.5, 0., 0., 1.', '50., 51.', 'missing cx, cy, fx, fy'),
+        ('image_width: 64', 'image_width: x', "could not convert string to float: 'x'"),
+        ('image_width: 64', '', 'missing width'),
+        ('camera_name', 'camera_nam', 'unknown camera_nam'),
+        ('[0.1, -0.2, 0., 0., 0.]', '[[1], 2]', 'list'),
+        ('50., 0., 31.5, 0., 51.', '{}, [], 3, 4, 5', 'dict'),
+    ],
+)  # fmt: skip
+def test_a_damaged_calibration_of_ros_is_one_error(tmp_path, before, after, message):
+    path = tmp_path / 'camera.yaml'
+    path.write_text(ROS_CALIBRATION.replace(before, after, 1))
+    with pytest.raises(CameraError, match=message):
+        read_camera_file(path)
+
+
 @pytest.mark.parametrize(
     ('line', 'message'),
     [
         ('abc rgb/0.png', r"rgb\.txt:1: expected 'stamp path', got 'abc rgb/0\.png'"),
         ('1.5', r"rgb\.txt:1: expected 'stamp path'"),
-        ('2.0 rgb/0.png\n1.0 rgb/1.png', 'stamps must increase, but 1.000000000 follows 2.000000000'),
+        ('\n'.join(f'1.0 rgb/{index}.png' for index in range(8)), 'stamps must differ, but 7 of 8 are there already'),
+        ('# stamp path', r'rgb\.txt: no image in it; expected lines with stamp and path'),
+        ('1.0 rgb/0.png\nx\n' * 4, r"rgb\.txt:2: expected 'stamp path', got 'x'"),
     ],
 )
 def test_broken_list(tmp_path, line, message):
@@ -141,6 +190,48 @@ def test_broken_list(tmp_path, line, message):
     (folder / 'rgb.txt').write_text(line)
     with pytest.raises(DatasetError, match=message):
         tum.read(folder)
+
+
+TIMES_S = [1 + 0.03 * index for index in range(20)]
+ROWS = [f'{BASE + seconds:.2f} rgb/{index}.png' for index, seconds in enumerate(TIMES_S)]
+SORTED = 'the lines are not in the order of their stamps, and are sorted'
+
+
+@pytest.mark.parametrize(
+    ('lines', 'missing', 'said'),
+    [
+        (ROWS[::-1], None, SORTED),
+        ([*ROWS[10:], *ROWS[:10]], None, SORTED),
+        (
+            [*ROWS[:5], ROWS[4].replace('/4', '/9'), *ROWS[5:]],
+            None,
+            '1 of 21 lines have a stamp that is there already and are left out',
+        ),
+        ([*ROWS[:5], 'torn', *ROWS[6:]], 5, r"rgb\.txt:6: expected 'stamp path', got 'torn'; of 20 lines 1 are left out"),
+        ([*ROWS[:19], '1.5'], 19, r"rgb\.txt:20: expected 'stamp path', got '1\.5'; of 20 lines 1 are left out"),
+        (['timestamp filename', *ROWS], None, ''),
+        ([row.replace(' ', ',') for row in ROWS], None, ''),
+        ([row.replace(' ', '; ') for row in ROWS], None, ''),
+        ([row.replace(' ', ' "') + '"' for row in ROWS], None, ''),
+    ],
+)
+def test_lists_that_people_write(tmp_path, caplog, lines, missing, said):
+    """Single lines cost themselves; their order is that of the stamps."""
+    folder = write_tum(tmp_path, TIMES_S, TIMES_S)
+    (folder / 'rgb.txt').write_text('\n'.join(lines) + '\n')
+    read = tum.read(folder)
+    assert [int(read[index].rgb[0, 0, 0]) // 10 for index in range(len(read))] == [i for i in range(20) if i != missing]
+    assert re.search(said, caplog.text) if said else not caplog.records
+
+
+@pytest.mark.parametrize('is_turned', [False, True])
+def test_associations_that_people_write(tmp_path, caplog, is_turned):
+    folder = write_tum(tmp_path, TIMES_S, TIMES_S)
+    (folder / 'rgb.txt').unlink()
+    rows = [f'{seconds:.2f},rgb/{index}.png,{seconds:.2f},depth/{index}.png' for index, seconds in enumerate(TIMES_S)]
+    (folder / 'associations.txt').write_text('\n'.join([*rows[::-1], 'torn'] if is_turned else rows))
+    assert len(tum.read(folder)) == 20
+    assert (SORTED in caplog.text) == ("got 'torn'" in caplog.text) == is_turned
 
 
 def cut(path, length):

@@ -265,6 +265,36 @@ def test_overwrite_refuses_a_run_json_of_another_program(tmp_path: Path, text: s
     assert tree(tmp_path) == before
 
 
+@pytest.mark.parametrize('overwrite', [False, True])
+def test_a_folder_that_is_being_written_is_not_taken(tmp_path: Path, overwrite: bool) -> None:
+    """Neither by another process nor by another run of this one; nor is it resumed. It is free again when the writer has ended."""
+    writer = """
+import sys
+from pathlib import Path
+from splatam_core.config import load_config
+from splatam_core.runs.record import RunDescription
+from splatam_core.runs.writer import RunFolder
+run = RunFolder.create(Path(sys.argv[1]), load_config('quick'), RunDescription('splatam_node'))
+print('writes', flush=True)
+input()
+"""
+    with subprocess.Popen([sys.executable, '-c', writer, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stdout.readline() == b'writes\n'
+        with pytest.raises(RunFolderError, match='is in use' if overwrite else 'exists'):
+            RunFolder.create(tmp_path, CONFIG, NODE, overwrite=overwrite)
+        with pytest.raises(RunFolderError, match='is in use'):
+            RunFolder.reopen(tmp_path, 0, None)
+        process.kill()
+    run = RunFolder.create(tmp_path, CONFIG, NODE, overwrite=True)
+    with pytest.raises(RunFolderError, match='is in use'):
+        RunFolder.create(tmp_path, CONFIG, NODE, overwrite=True)
+    restarted = written(run, 0).restarted(CONFIG)
+    with pytest.raises(RunFolderError, match='is in use'):
+        RunFolder.create(tmp_path, CONFIG, NODE, overwrite=True)
+    restarted.close()
+    RunFolder.create(tmp_path, CONFIG, NODE, overwrite=True).close()
+
+
 def test_overwrite_follows_no_link_out_of_the_folder(tmp_path: Path) -> None:
     elsewhere, run = tmp_path / 'elsewhere', tmp_path / 'run'
     (elsewhere / 'checkpoints').mkdir(parents=True)

@@ -154,6 +154,16 @@ def test_anchors_and_aliases_are_refused_everywhere(tmp_path, text):
         parse_overrides(['width=&a 3'])
 
 
+@pytest.mark.parametrize('text', ['fx: 70\n' + CAMERA, CAMERA + 'distortion: {k1: 0, k1: 1}\n'])
+def test_a_key_that_is_there_twice_is_refused_everywhere(tmp_path, text):
+    """Which of the two is meant, nobody can tell."""
+    path = tmp_path / 'camera.yaml'
+    path.write_text(text)
+    for read in (read_camera_file, lambda path: load_config(str(path))):
+        with pytest.raises((CameraError, ConfigError), match="the key '(fx|k1)' is there twice, line [0-9]+ and below; keep one"):
+            read(path)
+
+
 @pytest.mark.parametrize(
     'value',
     ['.inf', '.nan', '640.5', '2001-99-99', '!!int ""', '!!bool x', '!!timestamp x', '9' * 30, '9' * 5000, '1e300',

@@ -27,6 +27,8 @@ from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.rasterizer import make_rasterizer
 from splatam_core.runs.checkpoints import Checkpoints, Progress, read_checkpoint
 from splatam_core.slam import Slam
+from splatam_core.tracking.alignment import make_aligner
+from splatam_core.tracking.pyramid import frame_level
 from splatam_core.types import RgbdFrame, Status
 
 GRIDS = [(ratio, bent) for ratio in (1.2, 1.5, 2.0, 3.0, 4.0) for bent in (False, True)]
@@ -65,6 +67,7 @@ def test_depth_that_is_dense_where_the_sensor_sees_a_surface_is_no_grid() -> Non
     for dense in (depth_m, speckled, np.zeros_like(depth_m)):
         assert reading_spacing(dense) == 1.0
         assert new_widths(view_of(dense)) is None
+        assert frame_level(view_of(dense), make_aligner(1, torch.device('cpu'))).depth_share == 1.0  # exactly: nothing changes
 
 
 SMALL_WIDTHS = (48, 64, 80, 160, 320)

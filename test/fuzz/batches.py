@@ -20,6 +20,7 @@ from typing import IO, Any
 
 import cv2
 import torch
+from crossing import Crossing
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from kinds.base import Case, Kind, Tally
 
@@ -30,7 +31,13 @@ MEMORY_LIMIT = 12 << 30  # bytes of addresses of a child, so that a finding does
 
 @dataclass(frozen=True)
 class Batch:
-    """Values that one generator makes from one seed."""
+    """Values that one generator makes from one seed.
+
+    Attributes:
+        kind, case: what the values are.
+        seed: of all that is random.
+        size: number of values, drawn and crossed ones together.
+    """
 
     kind: Kind
     case: Case
@@ -90,17 +97,27 @@ class Board:
 
 
 def values_of(batch: Batch, use: Callable[[Any], None]) -> None:
-    """Calls a function, which must not raise, with each value of a batch: the case's examples, then the generated ones."""
+    """Calls a function, which must not raise, with each value of a batch: the case's examples, then the generated ones.
+
+    Between the values that are drawn, some are crossed from those drawn so far, where the case says so.
+    """
     for example in batch.case.examples:
         use(example)
+    crossings = batch.case.crossings
+    crossing = Crossing(batch.seed)
 
     @settings(
-        max_examples=batch.size, deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck)
-    )
+        max_examples=-(-batch.size // (1 + crossings)), deadline=None, database=None, phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )  # fmt: skip
     @seed(batch.seed)
     @given(batch.case.strategy)
     def generated(value: Any) -> None:
         use(value)
+        if crossings:
+            crossing.add(value)
+            for _ in range(crossings):
+                use(crossing.next_to(value))
 
     generated()
 

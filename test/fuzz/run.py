@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -190,6 +191,22 @@ def table(fuzzers: list[Fuzzer]) -> str:
     return '\n'.join([*lines, '', f'{machine()}.'])
 
 
+def goals_table(paths: Iterable[Path]) -> str:
+    """The counts in files beside the goals, in Markdown, as in docs/fuzzing.md. Of a kind in several files, the largest count."""
+    counts: dict[str, Count] = {}
+    for path in paths:
+        for name, saved in json.loads(path.read_text()).items():
+            count = Count(**saved['count'])
+            counts[name] = max(count, counts.get(name, count), key=lambda each: each.inputs)
+    lines = ['| kind | goal | inputs so far | used | refused cleanly | findings |', '|---|---|---|---|---|---|']
+    for name, kind in KINDS.items():
+        count = counts.get(name, Count())
+        lines.append(f'| {name} | {kind.long:,} | {count.inputs:,} | {count.used:,} | {count.refused:,} | {len(count.findings)} |')
+    commits = sorted({commit for count in counts.values() for commit in count.commits})
+    hours = sum(count.seconds for count in counts.values()) / 3600
+    return '\n'.join([*lines, '', f'{hours:.1f} hours; commits {", ".join(commits)}. {machine()}.'])
+
+
 def save_counts(path: Path | None, fuzzers: list[Fuzzer]) -> None:
     """Write the counts and the next seeds, from which ``read_counts`` continues, if there is a path."""
     if path is None:
@@ -218,6 +235,9 @@ def arguments() -> argparse.Namespace:
     parser.add_argument('--minutes', type=float, default=10.0, help='stop after this long [min]; default 10')
     parser.add_argument('--long', action='store_true', help='stop when each kind has had its number of inputs')
     parser.add_argument('--counts', type=Path, help='continue from the counts in this file, and save them there')
+    parser.add_argument(
+        '--table', type=Path, nargs='+', metavar='FILE', help='print the counts in these files beside the goals, and end'
+    )
     parser.add_argument('--seed', type=int, help='of the first batch; default: from the time, so that every run tries others')
     parser.add_argument('--inputs', type=int, default=4000, help='with --index: size of the batch of the finding')
     parser.add_argument('--index', type=int, help='try this value of the batch only, in this process')
@@ -227,6 +247,9 @@ def arguments() -> argparse.Namespace:
 def main() -> int:
     """Returns 1 if there is a finding."""
     given = arguments()
+    if given.table:
+        print(goals_table(given.table))
+        return 0
     kinds = [KINDS[name] for name in given.kind or KINDS if name not in given.leave_out]
     for missing in [kind for kind in kinds if kind not in available()]:
         print(f'{missing.name}: left out, because {missing.needs} is not installed')

@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import time
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import kinds
 import numpy as np
 import pytest
 from batches import Batch, Outcome, run_batch, values_of
+from crossing import Crossing
 from hypothesis import strategies as st
 from kinds import KINDS, available
 from kinds.base import Case, Kind, Tally
@@ -38,7 +40,8 @@ def test_a_few_inputs(name: str, tmp_path: Path) -> None:
                 raise
             tally.end_input()
 
-        values_of(Batch(kind, case, SEED, case.short), use)
+        crossings = min(case.crossings, 1)
+        values_of(Batch(kind, replace(case, crossings=crossings), SEED, case.short * (1 + crossings)), use)
         assert tally.inputs >= case.short / 2, case.name
 
 
@@ -116,8 +119,38 @@ def test_time_and_memory_beyond_the_bounds_are_findings() -> None:
 def test_a_seed_gives_the_same_values_again() -> None:
     def values() -> list[int]:
         found: list[int] = []
-        case = Case('numbers', st.integers(0, 10**9), lambda tally, number: None, examples=(3,))
+        case = Case('numbers', st.integers(0, 10**9), lambda tally, number: None, examples=(3,), crossings=2)
         values_of(Batch(Kind('numbers', 1, lambda folder: [case]), case, SEED, 30), found.append)
         return found
 
     assert values() == values() and values()[0] == 3
+
+
+@dataclass(frozen=True)
+class Parts:
+    """A value of several parts."""
+
+    seed: int
+    word: str
+    pair: tuple[int, int]
+    some: list[int]
+
+
+def test_crossed_values_are_made_of_the_parts_of_drawn_ones() -> None:
+    crossing = Crossing(SEED)
+    drawn = [Parts(number, f'word {number}', (number, -number), [number] * (2 + number)) for number in range(5)]
+    for value in drawn:
+        crossing.add(value)
+    crossed = [crossing.next_to(value) for value in drawn * 20]
+    assert {value.word for value in crossed} == {value.word for value in drawn}
+    assert {sum(value.pair) for value in crossed} > {0}  # parts of two
+    assert all(2 <= len(value.some) <= 6 for value in crossed)
+    assert len({value.seed for value in crossed}) == len(crossed)
+
+
+def test_crossed_texts_are_joined_of_two() -> None:
+    crossing = Crossing(SEED)
+    for value in (b'aaaa', b'bbbbbb'):
+        crossing.add(value)
+    crossed = {crossing.next_to(b'aaaa') for _ in range(50)}
+    assert len(crossed) > 5 and all(4 <= len(value) <= 6 for value in crossed)

@@ -175,6 +175,24 @@ def test_a_map_that_cannot_be_loaded_leaves_everything_as_it_is(graph: Graph, fr
     assert 'Traceback' not in live.node.text
 
 
+def test_a_map_of_the_run_itself_stays_on_the_disk(graph: Graph, frames: SyntheticSequence) -> None:
+    """Loading moves the run so far to previous/, and with it the file that was loaded. Nobody else can take the folder."""
+    out = graph.folder / 'run'
+    live = Live(graph, save_path=out, queue_policy='all', slam__tracking__align__relocalisation__enabled=False)
+    control = Control(graph)
+    assert live.show(still(frames, 0)) and live.show(still(frames, 1))
+    control.succeed('save_map')
+    saved = read_ply(out / 'map.ply').means
+    for number, name in enumerate(('', 'previous', ''), start=2):
+        control.change(load_path=str(out / name))
+        control.succeed('load_map')
+        assert len(read_ply(out / 'map.ply')) >= len(saved)
+        assert live.show(still(frames, number))
+    other = graph.run_node('-r', '__node:=other', save_path=out, overwrite=True)
+    assert other.wait() == 2 and other.says('run is in use')
+    assert live.show(still(frames, 9)) and read_run(out / 'previous').read_map().means.any()
+
+
 def test_a_live_map_that_cannot_be_saved_is_not_replaced(graph: Graph, frames: SyntheticSequence, saved_map: Path) -> None:
     out = graph.folder / 'run'
     live = Live(graph, save_path=out, queue_policy='all')

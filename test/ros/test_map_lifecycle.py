@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,10 +15,14 @@ from splatam_core.config import load_config
 from splatam_core.errors import ConfigError
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.runs.record import RunDescription
+from splatam_core.runs.writer import RunFolder
 from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status
 from splatam_ros.frames.rep105 import Located
+from splatam_ros.node.main import RosLog
 from splatam_ros.node.map_lifecycle import MapLifecycle
 from splatam_ros.node.parameters import node_options
+from splatam_ros.throttled_warnings import ThrottledWarnings
 
 CAMERA = PinholeCamera(4, 3, 4.0, 4.0, 1.5, 1.0)
 T_MAP_WORLD = se3.exp(np.array([1.0, 2, 3, 0, 0, 0.5]))
@@ -143,3 +149,35 @@ def test_a_map_that_cannot_be_loaded_changes_nothing(tmp_path: Path) -> None:
         with pytest.raises(ConfigError):
             bench.lifecycle.load(bench.slam)
         assert bench.slam.calls == bench.outputs.calls == []
+
+
+def overwriting(path: Path, **options: Any) -> Bench:
+    return Bench(save_path=str(path), overwrite=True, **options)
+
+
+def test_a_map_in_the_folder_to_overwrite_is_kept(tmp_path: Path) -> None:
+    """It would be removed before it is loaded: the map itself, the run's folder, and the run before a reset."""
+    run, link = tmp_path / 'run', tmp_path / 'link'
+    RunFolder.create(run, load_config('quick'), RunDescription('splatam_node')).close()
+    (run / 'map.ply').write_bytes(b'the map')
+    link.symlink_to(run)
+    for load_path in (run, run / 'map.ply', run / 'previous', link, link / 'map.ply', run / '..' / 'run'):
+        with pytest.raises(ConfigError, match='overwrite would remove it before it is loaded: save to another folder'):
+            overwriting(run, load_path=str(load_path))
+        with pytest.raises(ConfigError, match='overwrite would remove it'):
+            overwriting(link, load_path=str(load_path))
+    assert (run / 'map.ply').read_bytes() == b'the map' and (run / 'run.json').exists()
+    overwriting(run, load_path=str(tmp_path / 'run2' / 'map.ply'))
+    assert not (run / 'map.ply').exists()
+
+
+def test_warnings_are_one_line_whatever_messages_hold() -> None:
+    said: list[str] = []
+    logger: Any = SimpleNamespace(warning=said.append, debug=said.append)
+    bench = Bench(map_frame='map')
+    bench.lifecycle._logger = logger
+    for name in ('a\nb', '\x1b[31mred', 'x' * 100_000, '\u2028'):
+        bench.lifecycle.suggest(name, np.eye(4))
+        ThrottledWarnings(logger).warn('frame ids', f'depth is in frame {name}')
+        RosLog(logger).emit(logging.makeLogRecord({'msg': f'{name} is left out', 'levelno': logging.WARNING}))
+    assert len(said) == 12 and all(text.isprintable() and len(text) < 3000 for text in said)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from splatam_core.geometry.trajectory import Trajectory, stamp_text
 
 QUEUE_SIZE = 300  # ten seconds of one stream before the other begins
 JUMP_NS = 1_000_000_000
+LEAST_AGREEING = 3  # camera infos, among which one that differs is a stray
 MIN_STAMPS = 2
 
 _log = logging.getLogger(__name__)
@@ -46,10 +48,17 @@ class ImageEntry:
 
 @dataclass(frozen=True, slots=True)
 class StampedCamera:
-    """The camera that a camera info states, with the stamp of the camera info."""
+    """The camera that a camera info states, with the stamp of the camera info.
+
+    Attributes:
+        stamp_ns: of the first message.
+        calibration: the camera.
+        count: number of messages one after the other that state the same.
+    """
 
     stamp_ns: int
     calibration: CameraCalibration
+    count: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +178,7 @@ def read_index(recording: Recording, topics: ChosenTopics, *, use_receive_time: 
         raise CameraError(f'{recording.path}: {topics.info}: {reason}')
     for topic in (topics.rgb, topics.depth):
         _check_stamps(recording, topic, [entry.stamp_ns for entry in found.entries if entry.topic == topic])
-    cameras = _changes(sorted(found.cameras, key=lambda camera: camera.stamp_ns))
+    cameras = _changes(_without_strays(recording, topics, sorted(found.cameras, key=lambda camera: camera.stamp_ns)))
     return BagIndex(recording.path, topics, found.entries, cameras, _trajectory(found.poses_by_stamp))
 
 
@@ -202,6 +211,29 @@ def _add_camera(found: _Pass, recording: Recording, message: RawMessage, stamp_n
     cameras = found.cameras_by_p if remark else found.cameras
     if not cameras or cameras[-1].calibration != calibration or cameras[-1].stamp_ns > stamp_ns:
         cameras.append(StampedCamera(stamp_ns, calibration))
+    else:
+        cameras[-1] = replace(cameras[-1], count=cameras[-1].count + 1)
+
+
+def _without_strays(recording: Recording, topics: ChosenTopics, cameras: list[StampedCamera]) -> list[StampedCamera]:
+    """Leaves out single messages that state another camera than the messages before and after them, which agree."""
+    usual = max((camera.calibration for camera in cameras[:3]), key=lambda c: _num_close(c, cameras), default=None)
+    if usual is None or _num_close(usual, cameras) < LEAST_AGREEING:
+        return cameras
+    is_stray = [not usual.is_close_to(camera.calibration) for camera in cameras]
+    if not any(is_stray) or any(stray and camera.count > 1 for stray, camera in zip(is_stray, cameras, strict=True)):
+        return cameras
+    if any(before and after for before, after in pairwise(is_stray)):
+        return cameras
+    _log.warning(
+        '%s: %d messages on %s state another camera than those before and after them, and are left out',
+        recording.path, sum(is_stray), topics.info,
+    )  # fmt: skip
+    return [camera for stray, camera in zip(is_stray, cameras, strict=True) if not stray]
+
+
+def _num_close(calibration: CameraCalibration, cameras: list[StampedCamera]) -> int:
+    return sum(camera.count for camera in cameras if calibration.is_close_to(camera.calibration))
 
 
 def _choose_cameras(found: _Pass) -> None:

@@ -23,13 +23,15 @@ from kinds import (  # noqa: E402 - they use the tests' own material
     parameters,
     parsers,
     run_folders,
+    saved_keyframes,
 )
 from kinds.base import Kind  # noqa: E402
 
 KINDS = {
     module.KIND.name: module.KIND
     for module in (
-        messages, live, dataset_files, parsers, bags, run_folders, checkpoints, maps, configs, parameters, frames, native,
+        messages, live, dataset_files, parsers, bags, run_folders, checkpoints, saved_keyframes, maps, configs, parameters, frames,
+        native,
     )
 }  # fmt: skip
 """Kinds by name."""

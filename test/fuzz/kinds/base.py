@@ -73,6 +73,8 @@ class Case:
         check: uses a value. Whatever it raises is a finding.
         short: number of values in ``make test``.
         examples: values that are always tried first: those that were findings once.
+        crossings: after each drawn value, try this many that are crossed from drawn ones (see crossing.py). For what takes much
+            longer to draw than to use.
     """
 
     name: str
@@ -80,6 +82,7 @@ class Case:
     check: Callable[[Tally, Any], object]
     short: int = 40
     examples: tuple[Any, ...] = ()
+    crossings: int = 0
 
 
 @dataclass(frozen=True)

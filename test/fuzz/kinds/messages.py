@@ -262,17 +262,17 @@ def check_cloud_to_send(tally: Tally, value: tuple[np.ndarray, np.ndarray, int, 
 
 
 def cases(folder: Path) -> list[Case]:
-    many = 200
+    many, of_each = 200, 9
     return [
-        Case('images', st.tuples(raw_images(), st.sampled_from([None, 'bgr8', 'rgb8'])), check_image, many),
-        Case('compressed images', st.tuples(compressed_images(), SIZES), check_compressed_image, many),
-        Case('camera infos', st.tuples(INFO, st.booleans()), check_camera_info, many),
-        Case('point clouds', clouds(), check_point_cloud, many),
-        Case('poses', st.lists(st.one_of(st.floats(-2, 2), FLOAT), min_size=7, max_size=7), check_pose, many),
-        Case('stamps', st.tuples(HEADER, st.binary(max_size=40)), check_stamp, many),
-        Case('names of types', NAMES, check_name_of_type, many),
-        Case('images to send', images_to_send(), check_image_to_send),
-        Case('clouds to send', CLOUDS_TO_SEND, check_cloud_to_send),
+        Case('images', st.tuples(raw_images(), st.sampled_from([None, 'bgr8', 'rgb8'])), check_image, many, crossings=of_each),
+        Case('compressed images', st.tuples(compressed_images(), SIZES), check_compressed_image, many, crossings=of_each),
+        Case('camera infos', st.tuples(INFO, st.booleans()), check_camera_info, many, crossings=of_each),
+        Case('point clouds', clouds(), check_point_cloud, many, crossings=of_each),
+        Case('poses', st.lists(st.one_of(st.floats(-2, 2), FLOAT), min_size=7, max_size=7), check_pose, many, crossings=of_each),
+        Case('stamps', st.tuples(HEADER, st.binary(max_size=40)), check_stamp, many, crossings=of_each),
+        Case('names of types', NAMES, check_name_of_type, many, crossings=of_each),
+        Case('images to send', images_to_send(), check_image_to_send, crossings=of_each),
+        Case('clouds to send', CLOUDS_TO_SEND, check_cloud_to_send, crossings=of_each),
     ]
 
 

@@ -121,13 +121,13 @@ def _rectify(given: dict[str, Any]) -> None:
 def cases(folder: Path) -> list[Case]:
     camera_yaml = damage(CAMERA_YAML.encode()) | damage(CAMERA_YAML.encode() + b'distortion: [0.1, 0, 0, 0]\n')
     return [
-        Case('texts', TEXT, check_text, short=100),
-        Case('headers of images', st.builds(bytes.__add__, MAGIC, st.binary(max_size=200)), check_header, short=200),
-        Case('stamps', STAMP_TEXT, check_stamp, short=100),
-        Case('units of stamps', st.lists(st.floats(0, 4e9), min_size=2, max_size=50), check_seconds),
-        Case('trajectories', TRAJECTORY, partial(check_trajectory, folder), short=100),
-        Case('arrays', damage(npy(folder)) | st.binary(max_size=120), partial(check_npy, folder), short=100),
-        Case('camera.yaml', camera_yaml, partial(check_camera_file, folder)),
+        Case('texts', TEXT, check_text, short=100, crossings=4),
+        Case('headers of images', st.builds(bytes.__add__, MAGIC, st.binary(max_size=200)), check_header, short=200, crossings=4),
+        Case('stamps', STAMP_TEXT, check_stamp, short=100, crossings=4),
+        Case('units of stamps', st.lists(st.floats(0, 4e9), min_size=2, max_size=50), check_seconds, crossings=4),
+        Case('trajectories', TRAJECTORY, partial(check_trajectory, folder), short=100, crossings=4),
+        Case('arrays', damage(npy(folder)) | st.binary(max_size=120), partial(check_npy, folder), short=100, crossings=4),
+        Case('camera.yaml', camera_yaml, partial(check_camera_file, folder), crossings=4),
         Case('calibrations', calibrations(), check_calibration),
     ]
 

@@ -15,7 +15,7 @@ from splatam_core.errors import MapFileError, RunFolderError
 from splatam_core.runs.layout import check_is_free, remove_run
 from splatam_core.runs.record import read_run
 
-FILES = ('run.json', 'metrics.json', 'trajectory.txt', 'frames.csv', 'config.yaml', 'map.ply')
+FILES = ('run.json', 'metrics.json', 'trajectory.txt', 'trajectory_final.txt', 'frames.csv', 'config.yaml', 'map.ply')
 
 
 def check_file(run: FinishedRun, name: str, tally: Tally, data: bytes) -> None:
