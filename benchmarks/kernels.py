@@ -40,6 +40,7 @@ from splatam_core.rasterizer.base import BLUR_PX2, MIN_ALPHA
 from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.rasterizer.native import make_native_aligner
 from splatam_core.tracking import make_tracker
+from splatam_core.tracking.aligner import Linearization
 
 SIZES = ((320, 240), (640, 480))
 TILE = 8
@@ -221,12 +222,14 @@ def passes(name: str, cam: PinholeCamera) -> dict[str, Callable[[], float]]:
         render = rasterizer.render(moving, cam, pose)
         return once_ms(lambda: backward(render))
 
+    at = Linearization(
+        camera=cam, brightness=brightness, depth=view.depth.numpy(), layers=layers, color_motion=motion, depth_motion=motion,
+        velocity=np.zeros(6, np.float32), gain=1.0, bias=0.0, photometric_scale=0.05, depth_scale=0.02, max_depth_ratio=0.1,
+        readout=np.zeros(6, np.float32),
+    )  # fmt: skip
+
     def align() -> object:
-        return aligner.linearize(
-            brightness, view.depth.numpy(), layers, camera=cam, color_motion=motion, depth_motion=motion,
-            velocity=np.zeros(6, np.float32), gain=1.0, bias=0.0, photometric_scale=0.05, depth_scale=0.02, max_depth_ratio=0.1,
-            inlier_color=0.1, inlier_depth=0.05,
-        )  # fmt: skip
+        return aligner.linearize(at, inlier_color=0.1, inlier_depth=0.05)
 
     return {
         'forward': lambda: once_ms(lambda: rasterizer.render(still, cam, pose)),

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.tracking.aligner import Linearization
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -99,6 +100,12 @@ class LinearSystem:
     @property
     def g(self) -> NDArray[np.float64]: ...
     @property
+    def H_by_time(self) -> NDArray[np.float64]: ...
+    @property
+    def H_by_time_squared(self) -> NDArray[np.float64]: ...
+    @property
+    def g_by_time(self) -> NDArray[np.float64]: ...
+    @property
     def cost(self) -> float: ...
     @property
     def points(self) -> int: ...
@@ -132,42 +139,8 @@ class Aligner:
     def layers(self, brightness: Floats, depth: Floats, max_step: float) -> Floats: ...
     def fill_holes(self, depth: Floats, max_gap: int, max_step: float) -> Floats: ...
     def halve(self, brightness: Floats, depth: Floats, max_step: float) -> tuple[Floats, Floats]: ...
-    def linearize(
-        self,
-        brightness: Floats,
-        depth: Floats,
-        layers: Floats,
-        *,
-        camera: PinholeCamera,
-        color_motion: Floats,
-        depth_motion: Floats,
-        velocity: Floats,
-        gain: float,
-        bias: float,
-        photometric_scale: float,
-        depth_scale: float,
-        max_depth_ratio: float,
-        inlier_color: float,
-        inlier_depth: float,
-    ) -> LinearSystem: ...
-    def evidence(
-        self,
-        brightness: Floats,
-        depth: Floats,
-        layers: Floats,
-        *,
-        camera: PinholeCamera,
-        color_motion: Floats,
-        depth_motion: Floats,
-        velocity: Floats,
-        gain: float,
-        bias: float,
-        photometric_scale: float,
-        depth_scale: float,
-        max_depth_ratio: float,
-        max_depth_error: float,
-        step: int,
-    ) -> EvidenceSums: ...
+    def linearize(self, at: Linearization[Floats], *, inlier_color: float, inlier_depth: float) -> LinearSystem: ...
+    def evidence(self, at: Linearization[Floats], *, max_depth_error: float, step: int) -> EvidenceSums: ...
 
 def solve_blocks(place: NDArray[np.int32], blocks: Doubles, right_hand_side: Doubles) -> None:
     """Solves a sparse symmetric system of 6x6 blocks; the solution [N, 6] replaces the right-hand side.

@@ -115,6 +115,11 @@ class AlignmentConfig:
     time_offset: bool = setting(
         True, 'Estimate the time between the exposures of colour and depth. Switch off for cameras that trigger both at once.'
     )
+    rolling_shutter: bool = setting(
+        True,
+        'Estimate how long the camera takes to read an image, row by row, and align each row as of its time. Switch off for '
+        'cameras with a global shutter.',
+    )
     features: bool = setting(
         True, 'Where alignment fails, match ORB features between the frame and the map and align again from the pose they give.'
     )

@@ -61,7 +61,7 @@ class Slam(SlamLifecycle):
 
         # Depth sets the pace: colour that comes late, or twice, says little about how the camera moves.
         T_world_cam_depth, T_world_cam = se3.inverse(tracked.T_cam_world_depth), se3.inverse(tracked.T_cam_world)
-        self._motion.observe(frame.stamp_ns, T_world_cam_depth, is_trusted=verdict.status.is_trusted)
+        self._motion.observe(frame.stamp_ns, T_world_cam_depth, is_trusted=verdict.status.is_trusted, readout=tracked.readout)
         self._last_seen = seen
         if not verdict.status.is_trusted:
             return current.result(verdict, T_world_cam, self, tracking=tracked)
@@ -71,6 +71,7 @@ class Slam(SlamLifecycle):
                 correct(self._mapper, self.graph, self._tracker, self.config.tracking, current.index)
         posed = PosedFrame(seen, tracked.T_cam_world, self.config.mapping, current.index)
         plan = self._mapper.schedule.plan(current.index, tracked.visible_fraction)
+        posed = self._mapper.still(posed, plan)
         self._mapper.densify(posed, plan)
         current.clock.lap('densify')
         window = self._mapper.select(posed, plan)
@@ -89,11 +90,12 @@ class Slam(SlamLifecycle):
         """Finds the pose of a view: from the last pose, and where that is uncertain, also from the last one to be trusted."""
         if self._relocaliser.state.is_anywhere:
             return unknown()
+        gaussians, time_offset = self.map.gaussians, self._motion.time_offset
         found = [
             self._tracker.track(
-                view, self.map.gaussians, predicted.T_cam_world, se3.inverse(predicted.T_world_cam_before), self._motion.time_offset
+                view, gaussians, at.T_cam_world, se3.inverse(at.T_world_cam_before), time_offset, readout=at.readout
             )
-            for predicted in predictions
+            for at in predictions
         ]
         return self._judge.choose(found, self._with_motion_seen(predictions, found[0], view), self.config.tracking)
 

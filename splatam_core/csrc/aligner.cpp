@@ -5,6 +5,8 @@
 #include <cstring>
 #include <limits>
 
+#include "readout.hpp"
+
 namespace splatam {
 namespace {
 
@@ -32,6 +34,17 @@ void add(AlignmentSums& total, const AlignmentSums& part) {
   total.cost += part.cost;
   total.points += part.points, total.compared += part.compared;
   total.seen += part.seen, total.agreeing += part.agreeing;
+}
+
+void add(Aligner::RowMoments& total, const AlignmentSums& row, double time) {
+  for (int i = 0; i < kUnknowns * (kUnknowns + 1) / 2; ++i)
+    total.H1[i] += time * row.H[i], total.H2[i] += time * time * row.H[i];
+  for (int i = 0; i < kUnknowns; ++i) total.g1[i] += time * row.g[i];
+}
+
+void add(Aligner::RowMoments& total, const Aligner::RowMoments& part) {
+  for (int i = 0; i < kUnknowns * (kUnknowns + 1) / 2; ++i) total.H1[i] += part.H1[i], total.H2[i] += part.H2[i];
+  for (int i = 0; i < kUnknowns; ++i) total.g1[i] += part.g1[i];
 }
 
 // See Aligner::fill_holes; one row or column of count pixels, stride floats apart.
@@ -64,22 +77,27 @@ void Aligner::for_rows(int rows, const Task& task) {
   });
 }
 
-Aligner::Result Aligner::linearize(const float* brightness, const float* depth, const Camera& camera,
-                                   const float* layers, const Pose& color_motion, const Pose& depth_motion,
-                                   const AlignmentSettings& settings) {
-  std::vector<AlignmentSums> sums(pieces_of(camera.height));  // added in order, because sums of floats depend on it
-  std::vector<ResidualHistogram> histograms(threads_);        // counts do not
-  for_rows(camera.height, [&](int piece, int worker, int begin, int end) {
-    kernels_.align(brightness, depth, camera, begin, end, layers, color_motion, depth_motion, settings, sums[piece],
-                   histograms[worker]);
+Aligner::Result Aligner::linearize(const Aligned& at) {
+  std::vector<AlignmentSums> sums(pieces_of(at.camera.height));  // added in order, because sums of floats depend on it
+  std::vector<ResidualHistogram> histograms(threads_);           // counts do not
+  std::vector<RowMoments> moments(sums.size());
+  const Readout readout(at.readout);
+  for_rows(at.camera.height, [&](int piece, int worker, int begin, int end) {
+    for (int row = begin; row < end; ++row) {
+      const float time = time_of_row(row, at.camera.height);
+      AlignmentSums of_row{};
+      kernels_.align(at.brightness, at.depth, at.camera, row, row + 1, at.layers, readout.at(at.color_motion, time),
+                     readout.at(at.depth_motion, time), at.settings, of_row, histograms[worker]);
+      add(sums[piece], of_row), add(moments[piece], of_row, time);
+    }
   });
-  for (std::size_t piece = 1; piece < sums.size(); ++piece) add(sums[0], sums[piece]);
+  for (std::size_t piece = 1; piece < sums.size(); ++piece) add(sums[0], sums[piece]), add(moments[0], moments[piece]);
   for (int worker = 1; worker < threads_; ++worker)
     for (int bin = 0; bin < kResidualBins; ++bin) {
       histograms[0].photometric[bin] += histograms[worker].photometric[bin];
       histograms[0].depth[bin] += histograms[worker].depth[bin];
     }
-  return {sums[0], median(histograms[0].photometric), median(histograms[0].depth)};
+  return {sums[0], moments[0], median(histograms[0].photometric), median(histograms[0].depth)};
 }
 
 Aligner::Evidence Aligner::evidence(const Aligned& images) {

@@ -16,14 +16,20 @@ class Aligner {
     pool_.reserve(threads);
   }
 
+  // Sums over the rows of what each adds to H and g, times when it is read (see time_of_row), and times the square of
+  // that.
+  struct RowMoments {
+    double H1[kUnknowns * (kUnknowns + 1) / 2], H2[kUnknowns * (kUnknowns + 1) / 2], g1[kUnknowns];
+  };
+
   struct Result {
     AlignmentSums sums;
+    RowMoments moments;
     float photometric_median, depth_median;  // of the absolute residuals
   };
 
   // Linearises the residuals.
-  Result linearize(const float* brightness, const float* depth, const Camera&, const float* layers,
-                   const Pose& color_motion, const Pose& depth_motion, const AlignmentSettings&);
+  Result linearize(const Aligned&);
 
   // Sums what the residuals say about the pose.
   struct Evidence {

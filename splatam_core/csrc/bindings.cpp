@@ -145,7 +145,7 @@ double fit(Engine& engine, const py::object& means, const py::object& log_scales
 
 // Aligner::Result as Python sees it.
 struct LinearSystem {
-  py::array_t<double> H, g;  // [kUnknowns, kUnknowns], [kUnknowns]
+  py::array_t<double> H, g, H_by_time, H_by_time_squared, g_by_time;  // [kUnknowns, kUnknowns], [kUnknowns]
   double cost;
   std::int64_t points, compared, seen, agreeing;
   float photometric_median, depth_median;
@@ -172,30 +172,62 @@ GivenLevel level_of(const py::object& brightness, const py::object& depth) {
           values<float>(depth, "depth", {size.height, size.width})};
 }
 
-LinearSystem linearize(Aligner& aligner, const py::object& brightness, const py::object& depth,
-                       const py::object& layers, const py::object& camera, const py::object& color_motion,
-                       const py::object& depth_motion, const py::object& velocity, float gain, float bias,
-                       float photometric_scale, float depth_scale, float max_depth_ratio, float inlier_color,
-                       float inlier_depth) {
-  const GivenLevel level = level_of(brightness, depth);
-  const float* frame = values<float>(layers, "layers", {level.size.height, level.size.width, kLayers});
-  const Camera pinhole = camera_of(camera, level.size);
-  const float* v = values<float>(velocity, "velocity", {6});
-  const AlignmentSettings settings{
-      gain,         bias,        {v[0], v[1], v[2], v[3], v[4], v[5]}, photometric_scale, depth_scale, max_depth_ratio,
-      inlier_color, inlier_depth};
-  const Pose color_pose = pose_of(color_motion, "color_motion"), depth_pose = pose_of(depth_motion, "depth_motion");
+// An attribute of a Linearization (splatam_core/tracking/aligner.py).
+py::object member(const py::object& at, const char* name) {
+  if (!py::hasattr(at, name)) throw py::type_error(std::string("at has no ") + name + "; expected a Linearization");
+  return at.attr(name);
+}
+
+float number(const py::object& at, const char* name) {
+  try {
+    return member(at, name).cast<float>();
+  } catch (const py::cast_error&) {
+    throw py::type_error(std::string(name) + " is no number; expected a float");
+  }
+}
+
+// A Linearization, checked. It holds the arrays.
+struct GivenLinearization {
+  explicit GivenLinearization(const py::object& at)
+      : brightness(member(at, "brightness")), depth(member(at, "depth")), layers(member(at, "layers")) {
+    const GivenLevel level = level_of(brightness, depth);
+    images.brightness = level.brightness, images.depth = level.depth;
+    images.layers = values<float>(layers, "layers", {level.size.height, level.size.width, kLayers});
+    images.camera = camera_of(member(at, "camera"), level.size);
+    images.color_motion = pose_of(member(at, "color_motion"), "color_motion");
+    images.depth_motion = pose_of(member(at, "depth_motion"), "depth_motion");
+    AlignmentSettings& settings = images.settings;
+    settings.gain = number(at, "gain"), settings.bias = number(at, "bias");
+    const py::object velocity = member(at, "velocity");
+    std::copy_n(values<float>(velocity, "velocity", {6}), 6, settings.velocity);
+    const py::object readout = member(at, "readout");
+    std::copy_n(values<float>(readout, "readout", {6}), 6, images.readout);
+    settings.photometric_scale = number(at, "photometric_scale"), settings.depth_scale = number(at, "depth_scale");
+    settings.max_depth_ratio = number(at, "max_depth_ratio");
+  }
+
+  py::object brightness, depth, layers;
+  Aligned images{};
+};
+
+LinearSystem linearize(Aligner& aligner, const py::object& at, float inlier_color, float inlier_depth) {
+  GivenLinearization given(at);
+  given.images.settings.inlier_color = inlier_color, given.images.settings.inlier_depth = inlier_depth;
   Aligner::Result result;
   {
     py::gil_scoped_release release;
-    result = aligner.linearize(level.brightness, level.depth, pinhole, frame, color_pose, depth_pose, settings);
+    result = aligner.linearize(given.images);
   }
   const auto& sums = result.sums;
-  return {symmetric(sums.H),  py::array_t<double>(kUnknowns, sums.g),
-          sums.cost,          sums.points,
-          sums.compared,      sums.seen,
-          sums.agreeing,      result.photometric_median,
-          result.depth_median};
+  const auto& moments = result.moments;
+  LinearSystem system;
+  system.H = symmetric(sums.H), system.g = py::array_t<double>(kUnknowns, sums.g);
+  system.H_by_time = symmetric(moments.H1), system.H_by_time_squared = symmetric(moments.H2);
+  system.g_by_time = py::array_t<double>(kUnknowns, moments.g1);
+  system.cost = sums.cost, system.points = sums.points, system.compared = sums.compared;
+  system.seen = sums.seen, system.agreeing = sums.agreeing;
+  system.photometric_median = result.photometric_median, system.depth_median = result.depth_median;
+  return system;
 }
 
 // Aligner::Evidence as Python sees it.
@@ -208,28 +240,14 @@ py::array_t<double> matrix(const double (&entries)[rows][columns]) {
   return py::array_t<double>({rows, columns}, &entries[0][0]);
 }
 
-EvidenceOfView evidence(Aligner& aligner, const py::object& brightness, const py::object& depth,
-                        const py::object& layers, const py::object& camera, const py::object& color_motion,
-                        const py::object& depth_motion, const py::object& velocity, float gain, float bias,
-                        float photometric_scale, float depth_scale, float max_depth_ratio, float max_depth_error,
-                        int step) {
-  const GivenLevel level = level_of(brightness, depth);
+EvidenceOfView evidence(Aligner& aligner, const py::object& at, float max_depth_error, int step) {
   if (step < 1) throw py::value_error("step is " + std::to_string(step) + "; expected at least 1");
-  const float* v = values<float>(velocity, "velocity", {6});
-  const Aligned images{
-      level.brightness,
-      level.depth,
-      values<float>(layers, "layers", {level.size.height, level.size.width, kLayers}),
-      camera_of(camera, level.size),
-      pose_of(color_motion, "color_motion"),
-      pose_of(depth_motion, "depth_motion"),
-      {gain, bias, {v[0], v[1], v[2], v[3], v[4], v[5]}, photometric_scale, depth_scale, max_depth_ratio, 0.0f, 0.0f},
-      max_depth_error,
-      step};
+  GivenLinearization given(at);
+  given.images.max_depth_error = max_depth_error, given.images.step = step;
   Aligner::Evidence found;
   {
     py::gil_scoped_release release;
-    found = aligner.evidence(images);
+    found = aligner.evidence(given.images);
   }
   return {matrix(found.claimed), matrix(found.shared), matrix(found.scores), matrix(found.cells)};
 }
@@ -313,6 +331,9 @@ void bind_aligner(py::module_& module) {
   py::class_<LinearSystem>(module, "LinearSystem")
       .def_readonly("H", &LinearSystem::H)
       .def_readonly("g", &LinearSystem::g)
+      .def_readonly("H_by_time", &LinearSystem::H_by_time)
+      .def_readonly("H_by_time_squared", &LinearSystem::H_by_time_squared)
+      .def_readonly("g_by_time", &LinearSystem::g_by_time)
       .def_readonly("cost", &LinearSystem::cost)
       .def_readonly("points", &LinearSystem::points)
       .def_readonly("compared", &LinearSystem::compared)
@@ -328,14 +349,8 @@ void bind_aligner(py::module_& module) {
   py::class_<Aligner>(module, "Aligner")
       .def(py::init([](int threads) { return std::make_unique<Aligner>(checked_threads(threads)); }),
            py::arg("threads"))
-      .def("linearize", &linearize, py::arg("brightness"), py::arg("depth"), py::arg("layers"), py::kw_only(),
-           py::arg("camera"), py::arg("color_motion"), py::arg("depth_motion"), py::arg("velocity"), py::arg("gain"),
-           py::arg("bias"), py::arg("photometric_scale"), py::arg("depth_scale"), py::arg("max_depth_ratio"),
-           py::arg("inlier_color"), py::arg("inlier_depth"))
-      .def("evidence", &evidence, py::arg("brightness"), py::arg("depth"), py::arg("layers"), py::kw_only(),
-           py::arg("camera"), py::arg("color_motion"), py::arg("depth_motion"), py::arg("velocity"), py::arg("gain"),
-           py::arg("bias"), py::arg("photometric_scale"), py::arg("depth_scale"), py::arg("max_depth_ratio"),
-           py::arg("max_depth_error"), py::arg("step"))
+      .def("linearize", &linearize, py::arg("at"), py::kw_only(), py::arg("inlier_color"), py::arg("inlier_depth"))
+      .def("evidence", &evidence, py::arg("at"), py::kw_only(), py::arg("max_depth_error"), py::arg("step"))
       .def("halve", &halve, py::arg("brightness"), py::arg("depth"), py::arg("max_step"))
       .def("fill_holes", &fill_holes, py::arg("depth"), py::arg("max_gap"), py::arg("max_step"))
       .def("layers", &layers, py::arg("brightness"), py::arg("depth"), py::arg("max_step"));

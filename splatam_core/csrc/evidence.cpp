@@ -5,6 +5,8 @@
 #include <cstddef>
 #include <cstring>
 
+#include "readout.hpp"
+
 namespace splatam {
 namespace {
 
@@ -186,12 +188,17 @@ void add_point(const Aligned& images, int x, int y, int cell, RowSums& row, Evid
 
 }  // namespace
 
-void sum_evidence(const Aligned& images, int cell_row, EvidenceSums& sums) {
+void sum_evidence(const Aligned& given, int cell_row, EvidenceSums& sums) {
+  const Readout readout(given.readout);
+  Aligned images = given;  // as the row that is summed sees it
   const int first = images.step / 2;
   const auto compared = [&](int side) { return (side - first + images.step - 1) / images.step; };
   const int rows = compared(images.camera.height), columns = compared(images.camera.width);
   for (int row = 0; row < rows; ++row) {
     if (row * kCellRows / rows != cell_row) continue;
+    const float time = time_of_row(first + row * images.step, images.camera.height);
+    images.color_motion = readout.at(given.color_motion, time);
+    images.depth_motion = readout.at(given.depth_motion, time);
     RowSums of_row{};
     for (int column = 0; column < columns; ++column)
       add_point(images, first + column * images.step, first + row * images.step, column * kCellColumns / columns,

@@ -14,6 +14,7 @@ struct Aligned {
   Camera camera;
   Pose color_motion, depth_motion;
   AlignmentSettings settings;
+  float readout[6];       // twist of the camera from the first row of an image to its last
   float max_depth_error;  // relative, of a reading that is near the map
   int step;               // every n-th pixel of every n-th row is compared
 };

@@ -32,7 +32,7 @@ class View:
     Attributes:
         camera: the pinhole of both images.
         rgb8: [H, W, 3] uint8.
-        depth: [H, W] metres, 0 = no reading.
+        depth: [H, W] metres, 0 = no reading; negative in keyframes where nothing is compared (``mapping.ghosts``).
         spacing: mean distance in pixels between neighbouring readings; more than 1 if they are a grid with holes.
     """
 

@@ -14,6 +14,8 @@ from splatam_core.images.filters import box_sums, median
 from splatam_core.images.spacing import WINDOW
 from splatam_core.images.view import View, unproject
 from splatam_core.mapping.gaussian_map import GaussianMap
+from splatam_core.mapping.ghosts import ghosts, seen_through
+from splatam_core.mapping.posed import PosedView
 from splatam_core.rasterizer import Gaussians, Rasterizer, Render
 from splatam_core.rasterizer.base import BLUR_PX2
 
@@ -39,21 +41,35 @@ MAX_ALONE = 0.001
 
 def densify(
     gaussian_map: GaussianMap, view: View, T_cam_world: Tensor, rasterizer: Rasterizer, config: DensificationConfig
-) -> None:
-    """Adds the Gaussians that make the map explain the view."""
+) -> Tensor:
+    """Removes the Gaussians that the view sees through, and adds those that make the map explain it.
+
+    Returns:
+        [K, 3] where the Gaussians were that were removed.
+    """
     view = view.narrowed(config.scale, config.max_width)
+    gone = gaussian_map.means.new_zeros(0, 3)
 
     def render() -> Render:
         return rasterizer.render(gaussian_map.gaussians.detached(), view.camera, T_cam_world)
 
     with torch.no_grad():
-        chosen = without_speckles(unexplained(render(), view, config), view)
+        before = render()
+        through = seen_through(before, view) if config.depth_noise_ratio > 0 else None  # the paper removes nothing
+        if through is not None:
+            means = gaussian_map.means.detach()
+            is_ghost = ghosts(means, PosedView(view, T_cam_world), through)
+            gone = means[is_ghost]
+            gaussian_map.keep(~is_ghost)
+            before = render()
+        chosen = without_speckles(unexplained(before, view, config), view)
         depth, widths_px = view.depth, new_widths(view)
         added = gaussian_map.append(new_gaussians(view, chosen, depth, T_cam_world, config.opacity, widths_px))
         chosen = chosen.masked_scatter(chosen, added)  # without those that were refused
         for _ in range(config.bias_correction_rounds):
             depth = corrected(depth, depth_bias(render(), view), view.depth)
             gaussian_map.replace_last(new_gaussians(view, chosen, depth, T_cam_world, config.opacity, widths_px))
+    return gone
 
 
 def corrected(depth: Tensor, bias: Tensor, reading: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from torch import Tensor
 from splatam_core.config import KeyframeConfig, SlamConfig
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.images.view import unproject
+from splatam_core.mapping.ghosts import without
 from splatam_core.mapping.posed import PosedFrame, PosedView
 
 _BATCH = 64  # keyframes whose overlap is computed at once; more would not fit a core's cache
@@ -58,6 +59,15 @@ class KeyframeStore(Sequence[PosedView]):
         for keyframe in [keyframe for keyframe in self._kept if keyframe.frame >= frame]:
             self._kept.remove(keyframe)
             self._copies.pop(keyframe, None)
+
+    def forget(self, means: Tensor) -> None:
+        """No longer compares what keyframes show of Gaussians that have gone, at means [K, 3]."""
+        means = means.cpu()
+        for index, old in enumerate(self._kept):
+            new = without(old, means)
+            if new is not old:
+                self._kept[index] = new
+                self._copies.pop(old, None)
 
     def place(self, T_cam_world: Sequence[Tensor]) -> None:
         """Moves all keyframes to other poses [4, 4] float32, one each."""

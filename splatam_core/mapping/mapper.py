@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from itertools import takewhile
 from typing import Any
 
@@ -14,15 +15,19 @@ from torch import Tensor
 
 from splatam_core.config import SlamConfig
 from splatam_core.geometry import se3
+from splatam_core.images.filters import nearest
+from splatam_core.images.observation import Observation
 from splatam_core.images.view import View, narrowing
 from splatam_core.interruption import Stop, never
 from splatam_core.mapping.densification import densify
 from splatam_core.mapping.gaussian_map import GaussianMap
+from splatam_core.mapping.ghosts import moved_in
 from splatam_core.mapping.keyframes import KeyframeStore, Window, select_keyframes, views_to_fit
 from splatam_core.mapping.optimizers import TimeLimit, make_optimizer
 from splatam_core.mapping.posed import PosedFrame, PosedView
 from splatam_core.mapping.schedule import MappingPlan, MappingSchedule
 from splatam_core.rasterizer import Rasterizer
+from splatam_core.rasterizer.base import NOT_COMPARED
 from splatam_core.types import Arrays
 
 _log = logging.getLogger(__name__)
@@ -30,6 +35,7 @@ _log = logging.getLogger(__name__)
 _KEPT = 0.9
 """Fraction of the largest number of Gaussians that is kept when it is exceeded, so that few frames copy the map."""
 
+_SEEN_BEFORE = 3  # keyframes that are asked what was free
 _MAX_GROWTH = 2.0
 """A Gaussian may grow to this many times its first radius, however near the surfaces of the first frame were."""
 
@@ -70,6 +76,25 @@ class Mapper:
         self.schedule = MappingSchedule(config, self._num_frames)
         self._optimizer = make_optimizer(self._rasterizer, config.mapping)
 
+    def still(self, frame: PosedFrame, plan: MappingPlan) -> PosedFrame:
+        """Returns a frame in which nothing is compared where something moves into space that was seen to be free."""
+        added = self._config.densification
+        if not (plan.densifies and added.depth_noise_ratio > 0 and len(self.keyframes)):
+            return frame
+        posed = PosedView(frame.device.view.narrowed(added.scale, added.max_width), frame.device.T_cam_world)
+        before = [self.keyframes.on_device(keyframe) for keyframe in self.keyframes[-_SEEN_BEFORE:]]
+        with torch.no_grad():
+            render = self._rasterizer.render(self.map.gaussians.detached(), posed.view.camera, posed.T_cam_world)
+            moving = moved_in(render, posed, before)
+        if moving is None:
+            return frame
+        _log.info('frame %d: something moves in %.0f %% of the view', frame.index, 100 * moving.float().mean())
+        host = frame.observation.host
+        size = host.camera.width, host.camera.height
+        mask = nearest(moving.float().to(host.depth.device), *size) > 0.5
+        host = replace(host, depth=torch.where(mask, NOT_COMPARED, host.depth))
+        return replace(frame, observation=Observation(host, host.to(frame.observation.device.depth.device)))
+
     def densify(self, frame: PosedFrame, plan: MappingPlan) -> None:
         """Adds Gaussians where the frame shows what the map lacks."""
         if not plan.is_used:
@@ -77,7 +102,11 @@ class Mapper:
         self._measure_scene(frame.observation.host)
         if plan.densifies:
             self.map.frame = frame.index
-            densify(self.map, frame.device.view, frame.device.T_cam_world, self._rasterizer, self._config.densification)
+            view, T_cam_world = frame.device.view, frame.device.T_cam_world
+            gone = densify(self.map, view, T_cam_world, self._rasterizer, self._config.densification)
+            if len(gone):
+                _log.info('frame %d sees through %d Gaussians: what they showed has gone', frame.index, len(gone))
+                self.keyframes.forget(gone)
             self._limit_size(frame.device.T_cam_world)
 
     def _limit_size(self, T_cam_world: Tensor) -> None:

@@ -35,6 +35,7 @@ from splatam_core.runs.archive import Content, pack, read_archive
 from splatam_core.runs.layout import KEYFRAMES
 from splatam_core.state import SlamState
 from splatam_core.tracking.motion import MotionState
+from splatam_core.tracking.readout import Readout
 from splatam_core.tracking.time_offset import TimeOffset
 from splatam_core.tracking.verdict import JudgeState
 from splatam_core.types import Arrays
@@ -186,6 +187,7 @@ def _to_content(state: SlamState, progress: Progress, digests: Sequence[str]) ->
         'keyframes': list(digests), 'rng': state.rng, 'scene_radius': state.scene_radius, 'num_frames': state.num_frames,
         'last_stamp_ns': state.last_stamp_ns, 'progress': asdict(progress),
         'motion_ns': [motion.stamp_ns, motion.interval_ns], 'time_offset': asdict(motion.time_offset),
+        'readout': asdict(motion.readout),
         'trusted_ns': motion.trusted_ns, 'judge': {name: getattr(state.judge, name) for name in _JUDGE},
     }  # fmt: skip
     arrays = {_MAP + name: array for name, array in state.map.items()}
@@ -262,6 +264,7 @@ def _from_content(path: Path, content: Content) -> Checkpoint:
             time_offset=TimeOffset(**values.get('time_offset', {})),  # 0.1.0 estimated it in every frame anew
             trusted_ns=values.get('trusted_ns'),
             T_world_cam_trusted=arrays.get('T_world_cam_trusted', np.eye(4)),
+            readout=Readout(**values.get('readout', {})),  # not before 0.3
         ),
         rng=values['rng'],
         scene_radius=values['scene_radius'],
@@ -294,7 +297,7 @@ def _check_values(values: Mapping[str, Any], arrays: Arrays) -> None:
     radius = values['scene_radius']
     if type(radius) not in (int, float) or not 0 <= radius < math.inf:
         raise ValueError(f'scene_radius = {radius!r}: expected a length')
-    for name in ('time_offset', 'judge'):  # neither was in 0.1.0
+    for name in ('time_offset', 'judge', 'readout'):  # none of them was in 0.1.0
         if not all(type(number) in (int, float, bool) and math.isfinite(number) for number in values.get(name, {}).values()):
             raise ValueError(f'{name} = {values[name]!r}: expected numbers')
     for name, shape in _MOTION_SHAPES.items():

@@ -57,7 +57,7 @@ def write_map_keyframes(path: Path, keyframes: Sequence[PosedView], places: Arra
     arrays |= {_PLACES + name: array for name, array in {**places, 'frames': frames}.items()}
     for index, keyframe in enumerate(keyframes):
         rgb, depth_m = keyframe.view.rgb8.numpy(force=True), keyframe.view.depth.numpy(force=True)
-        steps = np.minimum(np.rint(_STEPS_PER_M * depth_m), _FARTHEST).astype(np.uint16)
+        steps = np.clip(np.rint(_STEPS_PER_M * depth_m), 0, _FARTHEST).astype(np.uint16)
         arrays[f'rgb.{index}'] = _encoded('.jpg', rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
         arrays[f'depth.{index}'] = _encoded('.png', steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     pack(KIND, VERSION, Content(values, arrays)).write(path)

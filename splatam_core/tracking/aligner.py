@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Protocol, TypeVar
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,48 @@ from splatam_core.geometry.se3 import Matrix
 
 Array = NDArray[np.float32]
 ImageT = TypeVar('ImageT', Array, Tensor)
+OtherT = TypeVar('OtherT', Array, Tensor)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linearization(Generic[ImageT]):
+    """A reference and a frame of the same camera, and the estimate at which their residuals are linearised.
+
+    Attributes:
+        camera: the pinhole of both.
+        brightness: [H, W] of the reference.
+        depth: [H, W] of the reference.
+        layers: [H, W, C] of the frame.
+        color_motion: [4, 4] from the reference's camera to the frame's camera at the colour image's time.
+        depth_motion: [4, 4] the same at the depth image's time.
+        velocity: [6] twist by which ``color_motion`` changes per unit of time offset.
+        gain: brightness of the frame = gain * brightness of the reference + bias.
+        bias: see gain.
+        photometric_scale: scale of the residuals of brightness, for Student's t.
+        depth_scale: scale of the residuals of depth, relative to the depth.
+        max_depth_ratio: points whose relative depth differs by more are on another surface.
+        readout: [6] twist of the camera from the first row of an image to its last; 0 where all rows are read at once. The
+            motions are those at the middle row. A point is taken to be read with its row of the reference.
+    """
+
+    camera: PinholeCamera
+    brightness: ImageT
+    depth: ImageT
+    layers: ImageT
+    color_motion: Array
+    depth_motion: Array
+    velocity: Array
+    gain: float
+    bias: float
+    photometric_scale: float
+    depth_scale: float
+    max_depth_ratio: float
+    readout: Array
+
+    def converted(self, convert: Callable[[ImageT], OtherT]) -> Linearization[OtherT]:
+        """Returns the same with each of the images converted."""
+        given = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Linearization(**given | {name: convert(given[name]) for name in ('brightness', 'depth', 'layers')})
 
 
 class LinearSystem(Protocol):
@@ -29,6 +73,18 @@ class LinearSystem(Protocol):
     @property
     def g(self) -> Matrix:
         """[9] weighted gradient."""
+
+    @property
+    def H_by_time(self) -> Matrix:
+        """[9, 9] what each row of the reference adds to ``H``, times when it is read: from -0.5 for the first to 0.5."""
+
+    @property
+    def H_by_time_squared(self) -> Matrix:
+        """[9, 9] the same, times the square of that."""
+
+    @property
+    def g_by_time(self) -> Matrix:
+        """[9] what each row adds to ``g``, times when it is read."""
 
     @property
     def cost(self) -> float:
@@ -107,76 +163,20 @@ class Aligner(Protocol[ImageT]):
     def halve(self, brightness: ImageT, depth: ImageT, max_step: float) -> tuple[ImageT, ImageT]:
         """Returns both images [H // 2, W // 2] as means of 2x2 blocks; depth is NaN where a block spans a depth edge."""
 
-    def linearize(
-        self,
-        brightness: ImageT,
-        depth: ImageT,
-        layers: ImageT,
-        *,
-        camera: PinholeCamera,
-        color_motion: Array,
-        depth_motion: Array,
-        velocity: Array,
-        gain: float,
-        bias: float,
-        photometric_scale: float,
-        depth_scale: float,
-        max_depth_ratio: float,
-        inlier_color: float,
-        inlier_depth: float,
-    ) -> LinearSystem:
-        """Linearises the residuals of a reference in a frame of the same camera.
+    def linearize(self, at: Linearization[ImageT], *, inlier_color: float, inlier_depth: float) -> LinearSystem:
+        """Linearises the residuals of a reference in a frame.
 
         Args:
-            brightness: [H, W] of the reference.
-            depth: [H, W] of the reference.
-            layers: [H, W, C] of the frame.
-            camera: the pinhole of both.
-            color_motion: [4, 4] from the reference's camera to the frame's camera at the colour image's time.
-            depth_motion: [4, 4] the same at the depth image's time.
-            velocity: [6] twist by which ``color_motion`` changes per unit of time offset.
-            gain: brightness of the frame = gain * brightness of the reference + bias.
-            bias: see gain.
-            photometric_scale: scale of the residuals of brightness, for Student's t.
-            depth_scale: scale of the residuals of depth, relative to the depth.
-            max_depth_ratio: points whose relative depth differs by more are on another surface.
+            at: both images, and the estimate.
             inlier_color: largest residual of brightness of an inlier.
             inlier_depth: largest residual of depth of an inlier.
         """
 
-    def evidence(
-        self,
-        brightness: ImageT,
-        depth: ImageT,
-        layers: ImageT,
-        *,
-        camera: PinholeCamera,
-        color_motion: Array,
-        depth_motion: Array,
-        velocity: Array,
-        gain: float,
-        bias: float,
-        photometric_scale: float,
-        depth_scale: float,
-        max_depth_ratio: float,
-        max_depth_error: float,
-        step: int,
-    ) -> EvidenceSums:
+    def evidence(self, at: Linearization[ImageT], *, max_depth_error: float, step: int) -> EvidenceSums:
         """Sums what the residuals at the end of an alignment say about the pose.
 
         Args:
-            brightness: as of ``linearize``, and so are the arguments that follow.
-            depth: see there.
-            layers: see there.
-            camera: see there.
-            color_motion: see there.
-            depth_motion: see there.
-            velocity: see there.
-            gain: see there.
-            bias: see there.
-            photometric_scale: see there.
-            depth_scale: see there.
-            max_depth_ratio: see there.
+            at: both images, and the estimate.
             max_depth_error: relative depth by which a point near the map differs at most.
             step: every n-th pixel of every n-th row is compared.
         """

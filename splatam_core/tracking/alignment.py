@@ -33,6 +33,7 @@ from splatam_core.tracking.features import pose_by_features
 from splatam_core.tracking.gauss_newton import GaussNewton
 from splatam_core.tracking.motion import SeenMotion
 from splatam_core.tracking.pyramid import Level, frame_level, full_pyramid, half_pyramid, render_level
+from splatam_core.tracking.readout import ReadoutSeen
 from splatam_core.tracking.time_offset import TimeOffset
 from splatam_core.tracking.torch_aligner import TorchAligner
 from splatam_core.tracking.verdict import verify
@@ -50,6 +51,7 @@ class _Frame:
         gaussians: the map.
         T_cam_world_before: [4, 4] pose one frame ago; None if not known.
         time_offset: between colour and depth, before this frame.
+        readout: see ``Tracker.track``.
     """
 
     view: View
@@ -57,6 +59,7 @@ class _Frame:
     gaussians: Gaussians
     T_cam_world_before: Matrix | None
     time_offset: TimeOffset
+    readout: ReadoutSeen | None
 
 
 class AlignmentTracker:
@@ -79,10 +82,11 @@ class AlignmentTracker:
         T_cam_world: Matrix,
         T_cam_world_before: Matrix | None = None,
         time_offset: TimeOffset | None = None,
+        readout: ReadoutSeen | None = None,
     ) -> TrackingResult:
         """See ``Tracker.track``."""
         pyramid = half_pyramid(frame_level(view, self._aligner), self._aligner)
-        frame = _Frame(view, pyramid, gaussians, T_cam_world_before, time_offset or TimeOffset())
+        frame = _Frame(view, pyramid, gaussians, T_cam_world_before, time_offset or TimeOffset(), readout)
         found = self._align_twice(frame, T_cam_world)
         if self._is_good(found) or not self._config.align.features:
             return found
@@ -112,7 +116,7 @@ class AlignmentTracker:
         references = self._reference_pyramid(frame, T_cam_world)
         before = frame.T_cam_world_before
         predicted_motion = None if before is None else T_cam_world @ se3.inverse(before)
-        alignment = self._gauss_newton.align(references, frame.pyramid, predicted_motion, frame.time_offset)
+        alignment = self._gauss_newton.align(references, frame.pyramid, predicted_motion, frame.time_offset, readout=frame.readout)
         state, system = alignment.state, alignment.system
         num_readings = int((frame.pyramid[0].depth > 0).sum())
         return TrackingResult(
@@ -123,6 +127,7 @@ class AlignmentTracker:
             inlier_fraction=system.agreeing / max(1, system.compared),
             time_offset=alignment.time_offset,
             evidence=alignment.evidence,
+            readout=alignment.readout,
         )
 
     def _reference_pyramid(self, frame: _Frame, T_cam_world: Matrix) -> list[Level]:

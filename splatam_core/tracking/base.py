@@ -10,6 +10,7 @@ from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians
 from splatam_core.tracking.evidence import Evidence
 from splatam_core.tracking.motion import SeenMotion
+from splatam_core.tracking.readout import ReadoutSeen
 from splatam_core.tracking.time_offset import TimeOffset
 
 
@@ -25,6 +26,7 @@ class TrackingResult:
         inlier_fraction: fraction of those that agree with the map in depth and colour.
         time_offset: between colour and depth, after this frame.
         evidence: how far the pose may be trusted; None for a tracker that does not say.
+        readout: what the frame tells about the time that reading an image takes; None if nothing.
     """
 
     T_cam_world: Matrix
@@ -34,6 +36,7 @@ class TrackingResult:
     inlier_fraction: float
     time_offset: TimeOffset = TimeOffset()
     evidence: Evidence | None = None
+    readout: ReadoutSeen | None = None
 
 
 class Tracker(Protocol):
@@ -46,6 +49,7 @@ class Tracker(Protocol):
         T_cam_world: Matrix,
         T_cam_world_before: Matrix | None = None,
         time_offset: TimeOffset | None = None,
+        readout: ReadoutSeen | None = None,
     ) -> TrackingResult:
         """Finds the pose from which the map looks like the view; changes nothing.
 
@@ -55,6 +59,7 @@ class Tracker(Protocol):
             T_cam_world: [4, 4] predicted pose.
             T_cam_world_before: [4, 4] pose one frame ago; None if not known.
             time_offset: between colour and depth, as the frames before tell; None if they tell nothing.
+            readout: how long reading an image takes, as the frames before tell; None if they tell nothing.
         """
 
     def motion(self, view: View, before: View, T_now_before: Matrix) -> SeenMotion | None:

@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.se3 import Matrix
-from splatam_core.tracking.aligner import EvidenceSums
+from splatam_core.tracking.aligner import EvidenceSums, Linearization
 
 Image = NDArray[np.float32]
 Values = NDArray[np.float32]
@@ -59,41 +60,6 @@ class Evidence:
     explained: float
     num_explained: int
     pixel_rad: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Linearization:
-    """Where an alignment ended, see ``Aligner.evidence``.
-
-    Attributes:
-        camera: of both images.
-        brightness: [H, W] of the reference.
-        depth: [H, W] of the reference.
-        layers: [H, W, C] of the frame.
-        color_motion: [4, 4].
-        depth_motion: [4, 4].
-        velocity: [6].
-        gain: of the brightness.
-        bias: of the brightness.
-        scales: of the residuals of brightness and depth.
-        max_depth_ratio: points whose relative depth differs by more are on another surface.
-        max_depth_error: relative depth by which a point near the map differs at most.
-        step: every n-th pixel of every n-th row is compared.
-    """
-
-    camera: PinholeCamera
-    brightness: Image
-    depth: Image
-    layers: Image
-    color_motion: Matrix
-    depth_motion: Matrix
-    velocity: Matrix
-    gain: float
-    bias: float
-    scales: tuple[float, float]
-    max_depth_ratio: float
-    max_depth_error: float
-    step: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,15 +101,14 @@ def max_depth_error(depth_scale: float) -> float:
     return max(_MAX_DEPTH_ERROR, 3 * depth_scale)
 
 
-def summed(at: Linearization) -> Sums:
-    """Returns the sums over the points, in numpy; the native aligner takes a tenth of the time."""
-    points = _Points.of(at)
+def summed(at: Linearization[Image], max_depth_error: float, step: int) -> Sums:
+    """Returns what ``Aligner.evidence`` does, in numpy; the native aligner takes a tenth of the time."""
+    points = _Points.of(at, step)
     own, shared = points.by_frame(at), points.by_reference(at)
     scores = shared.brightness * (points.weights[0] * points.residuals[0])
     scores[_TWIST] += shared.depth * (points.weights[1] * points.residuals[1])
-    return Sums(
-        _normal_matrix(own, own, points), _normal_matrix(shared, own, points), points.cells(scores), points.cells(points.fit(at))
-    )
+    fit = points.fit(at, max_depth_error)
+    return Sums(_normal_matrix(own, own, points), _normal_matrix(shared, own, points), points.cells(scores), points.cells(fit))
 
 
 def weigh(sums: EvidenceSums, at: Knowns) -> Evidence:
@@ -187,9 +152,9 @@ class _Moved:
     inside: Mask
 
     @classmethod
-    def of(cls, points: Values, T: Matrix, camera: PinholeCamera) -> _Moved:
-        """Moves points [3, P] by a motion [4, 4]."""
-        x, y, z = T[:3, :3].astype(np.float32) @ points + T[:3, 3:].astype(np.float32)
+    def of(cls, points: Values, camera: PinholeCamera) -> _Moved:
+        """Projects points [3, P] in the frame's camera."""
+        x, y, z = points
         in_front = z > 0
         z = np.where(in_front, z, np.float32(1))
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
@@ -249,21 +214,22 @@ class _Points:
     weights: Values
 
     @classmethod
-    def of(cls, at: Linearization) -> _Points:
+    def of(cls, at: Linearization[Image], step: int) -> _Points:
         """Samples both images, as ``Aligner.linearize`` does at every pixel."""
         camera = at.camera
-        rows, columns = (np.arange(at.step // 2, side, at.step) for side in (camera.height, camera.width))
+        rows, columns = (np.arange(step // 2, side, step) for side in (camera.height, camera.width))
         layers = _layers(at.brightness, at.depth)[:, rows[:, None], columns].reshape(6, -1)
         cells = _cells(len(rows), len(columns))
         known = np.flatnonzero(layers[3] > 0)  # False for NaN
         reference, z = layers[:, known], layers[3, known]
         u, v = columns[known % len(columns)], rows[known // len(columns)]
         points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z]).astype(np.float32)
-        at_depth = _Moved.of(points, at.depth_motion, camera)
+        times = (rows[known // len(columns)] / max(1, camera.height - 1) - 0.5 * (camera.height > 1)).astype(np.float32)
+        at_depth = _Moved.of(_carried(points, at.depth_motion, at.readout, times), camera)
         frame = at_depth.sampled(at.layers)[:6]
         at_color = at_depth
         if not np.array_equal(at.color_motion, at.depth_motion):
-            at_color = _Moved.of(points, at.color_motion, camera)
+            at_color = _Moved.of(_carried(points, at.color_motion, at.readout, times), camera)
             frame[:3] = at_color.sampled(at.layers)[:3]
         met = at_depth.inside & ~np.isnan(frame[3])
         off = frame[3] / at_depth.z - 1
@@ -272,7 +238,7 @@ class _Points:
         difference = frame[0] - (np.float32(at.gain) * reference[0] + np.float32(at.bias))
         across = off * at_depth.incidence_cosine(frame, camera)
         residuals = np.stack([np.where(lit, difference, 0), np.where(seen, across, 0)]).astype(np.float32)
-        precisions = 1 / np.square(np.array(at.scales, np.float32))[:, None]
+        precisions = 1 / np.square(np.array((at.photometric_scale, at.depth_scale), np.float32))[:, None]
         weights = (6 / (5 + residuals**2 * precisions) * precisions).astype(np.float32)  # Student's t with five degrees of freedom
         return cls(
             cell=cells[known],
@@ -291,17 +257,17 @@ class _Points:
         """Returns [K, cells] sums of values [K, P] over the cells."""
         return np.stack([np.bincount(self.cell, of_one, ROWS * COLUMNS) for of_one in values])
 
-    def by_frame(self, at: Linearization) -> _Jacobians:
+    def by_frame(self, at: Linearization[Image]) -> _Jacobians:
         """Returns the derivatives that the frame's gradients give: those that Gauss-Newton uses."""
         return self._jacobians(self.frame, 1.0, at)
 
-    def by_reference(self, at: Linearization) -> _Jacobians:
+    def by_reference(self, at: Linearization[Image]) -> _Jacobians:
         """Returns the derivatives that the reference's gradients would give."""
         return self._jacobians(self.reference, at.gain, at)
 
-    def _jacobians(self, layers: Values, gain: float, at: Linearization) -> _Jacobians:
+    def _jacobians(self, layers: Values, gain: float, at: Linearization[Image]) -> _Jacobians:
         by_brightness = self.at_color.by_twist(np.float32(gain) * layers[1], np.float32(gain) * layers[2], at.camera)
-        others = [-self.reference[0], np.full_like(self.reference[0], -1), at.velocity.astype(np.float32) @ by_brightness]
+        others = [-self.reference[0], np.full_like(self.reference[0], -1), at.velocity @ by_brightness]
         point = self.at_depth
         by_depth = point.by_twist(layers[4], layers[5], at.camera)
         by_depth[2] -= 1
@@ -313,12 +279,20 @@ class _Points:
             np.where(self.seen & ~np.isnan(by_depth[0]), by_depth, np.float32(0)),
         )
 
-    def fit(self, at: Linearization) -> NDArray[Any]:
+    def fit(self, at: Linearization[Image], max_depth_error: float) -> NDArray[Any]:
         """Returns [9, P] what ``EvidenceSums.cells`` sums."""
         expected, found = (np.where(self.lit, image, 0) for image in (at.gain * self.reference[0] + at.bias, self.frame[0]))
-        near = self.met & (np.abs(self.frame[3] / self.at_depth.z - 1) < at.max_depth_error)
+        near = self.met & (np.abs(self.frame[3] / self.at_depth.z - 1) < max_depth_error)
         moments = [expected, found, expected * expected, found * found, expected * found, np.abs(self.residuals[0])]
         return np.stack([self.lit, self.met, near, *moments])
+
+
+def _carried(points: Values, T: Image, readout: Image, times: Values) -> Values:
+    """Moves points [3, P] by a motion [4, 4] at the middle row, and on by a twist [6], as ``csrc/readout.hpp`` does."""
+    moved = T[:3, :3] @ points + T[:3, 3:]
+    turn = se3.skew(readout[3:].astype(np.float64)).astype(np.float32)
+    speed = turn @ moved + readout[:3, None]
+    return moved + times * (speed + np.float32(0.5) * times * (turn @ speed))
 
 
 def _fitting_cells(sums: Matrix, camera: PinholeCamera) -> tuple[Mask, Mask]:

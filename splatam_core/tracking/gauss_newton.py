@@ -14,9 +14,10 @@ from torch import Tensor
 from splatam_core.config import TrackingConfig
 from splatam_core.geometry import se3
 from splatam_core.geometry.se3 import Matrix
-from splatam_core.tracking.aligner import Aligner, Array, LinearSystem
+from splatam_core.tracking.aligner import Aligner, Array, Linearization, LinearSystem
 from splatam_core.tracking.evidence import Evidence, Knowns, max_depth_error, step_of, weigh
 from splatam_core.tracking.pyramid import EDGE, Level
+from splatam_core.tracking.readout import ReadoutSeen
 from splatam_core.tracking.time_offset import TimeOffset
 
 _MIN_POINTS = 50
@@ -25,7 +26,7 @@ _FIRST_SCALES = 0.1, 0.02  # of residuals: brightness in [0, 1], relative depth
 _MIN_SCALES = 0.004, 0.001  # no sensor is better
 _MAD_TO_DEVIATION = 1.4826  # standard deviation over median absolute deviation, for a normal distribution
 _LEAST_WEIGHT = 1e-6
-_TWIST, _GAIN_AND_BIAS, _TIME_OFFSET = range(6), range(6, 8), range(8, 9)  # the unknowns
+_TWIST, _GAIN_AND_BIAS, _TIME_OFFSET, _READOUT = range(6), range(6, 8), range(8, 9), range(9, 10)  # the unknowns
 _PRIOR = np.array([0.3] * 6 + [0.1] * 2) ** -2  # variance^-1 of a step: m and rad; gain, bias
 
 
@@ -39,6 +40,7 @@ class AlignmentState:
         bias: see gain.
         time_offset: frame intervals by which the colour image is later than the depth image.
         velocity: [6] twist of the camera per frame interval.
+        readout: fraction of the interval from the first row of an image to its last.
     """
 
     depth_motion: Matrix
@@ -46,6 +48,7 @@ class AlignmentState:
     bias: float = 0.0
     time_offset: float = 0.0
     velocity: Matrix = field(default_factory=lambda: np.zeros(6))
+    readout: float = 0.0
 
     @property
     def color_motion(self) -> Matrix:
@@ -53,13 +56,14 @@ class AlignmentState:
         return se3.exp(self.time_offset * self.velocity) @ self.depth_motion if self.time_offset else self.depth_motion
 
     def moved(self, step: Matrix) -> AlignmentState:
-        """Returns the state after a step [9] of the unknowns."""
+        """Returns the state after a step [10] of the unknowns."""
         return AlignmentState(
             depth_motion=se3.exp(step[:6]) @ self.depth_motion,
             gain=self.gain + step[6],
             bias=self.bias + step[7],
             time_offset=self.time_offset + step[8],
             velocity=self.velocity,
+            readout=self.readout + step[9],
         )
 
 
@@ -73,6 +77,7 @@ class _Pair:
         depth_share: of the frame, see ``Level``.
         predicted_motion: [4, 4] from the camera one frame ago to the render's; None if that is not known.
         time_offset: between colour and depth, before this frame.
+        readout: how long reading an image takes, before this frame; None where it is not estimated.
     """
 
     reference: Level
@@ -80,6 +85,7 @@ class _Pair:
     depth_share: float
     predicted_motion: Matrix | None
     time_offset: TimeOffset
+    readout: ReadoutSeen | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,12 +97,14 @@ class Alignment:
         system: the residuals at the finest level.
         time_offset: between colour and depth, after this frame.
         weigh: returns what the residuals say about the state; it takes as long as a step.
+        readout: what the residuals say about the time that reading an image takes; None if nothing.
     """
 
     state: AlignmentState
     system: LinearSystem
     time_offset: TimeOffset
     weigh: Callable[[], Evidence]
+    readout: ReadoutSeen | None = None
 
     @property
     def evidence(self) -> Evidence:
@@ -118,6 +126,7 @@ class GaussNewton:
         exposure, time_offset = _GAIN_AND_BIAS if align.exposure else (), _TIME_OFFSET if align.time_offset else ()
         self._free = [*_TWIST, *exposure, *time_offset]  # the unknowns to solve for
         self._estimates_time_offset = align.time_offset
+        self._estimates_readout = align.rolling_shutter
 
     def align(
         self,
@@ -126,6 +135,8 @@ class GaussNewton:
         predicted_motion: Matrix | None,
         time_offset: TimeOffset,
         start_motion: Matrix | None = None,
+        *,
+        readout: ReadoutSeen | None = None,
     ) -> Alignment:
         """Aligns from coarse to fine, starting where the reference was rendered, or at another motion.
 
@@ -135,6 +146,7 @@ class GaussNewton:
             predicted_motion: [4, 4] from the camera one frame ago to the render's; None if that is not known.
             time_offset: between colour and depth, before this frame.
             start_motion: [4, 4] from the reference's camera to the frame's; None = none.
+            readout: see ``Tracker.track``; counts where the predicted motion is known.
 
         Returns:
             The state found, or the start where that explains the finest level better.
@@ -142,19 +154,23 @@ class GaussNewton:
         start = state = AlignmentState(np.eye(4) if start_motion is None else start_motion)
         if self._estimates_time_offset and predicted_motion is not None:
             state = replace(state, time_offset=time_offset.mean)
+        if not self._estimates_readout or predicted_motion is None:
+            readout = None
+        if readout is not None:
+            state = replace(state, readout=readout.mean)
         scales = _FIRST_SCALES
         for reference, frame in zip(reversed(references), reversed(frames), strict=True):
             layers = self._aligner.layers(frame.brightness, frame.depth, EDGE)
-            pair = _Pair(reference, layers, frame.depth_share, predicted_motion, time_offset)
+            pair = _Pair(reference, layers, frame.depth_share, predicted_motion, time_offset, readout)
             state, scales = self._iterate(pair, state, scales)
         system = self._linearize(pair, state, scales)
-        after = time_offset
+        after, equations, free = time_offset, _Equations.of(system, state, pair), self._unknowns(pair)
         if self._estimates_time_offset:
-            after = time_offset.updated(state.time_offset, self._time_offset_information(system))
+            after = time_offset.updated(state.time_offset, equations.information(_TIME_OFFSET[0], free))
         at_start = self._linearize(pair, start, scales)
         if not _is_better(at_start, system):
             return Alignment(start, at_start, time_offset, partial(self._weigh, pair, start, scales))
-        return Alignment(state, system, after, partial(self._weigh, pair, state, scales))
+        return Alignment(state, system, after, partial(self._weigh, pair, state, scales), _seen(equations, state, pair, free))
 
     def _iterate(
         self, pair: _Pair, state: AlignmentState, scales: tuple[float, float]
@@ -165,7 +181,7 @@ class GaussNewton:
                 state = replace(state, velocity=se3.log(state.depth_motion @ pair.predicted_motion))
             system = self._linearize(pair, state, scales)
             scales = _scales(system)
-            step = _step(system, state, self._free, pair.time_offset)
+            step = _Equations.of(system, state, pair).step(self._unknowns(pair))
             if step is None:
                 break
             state = state.moved(step)
@@ -174,13 +190,18 @@ class GaussNewton:
         return state, scales
 
     def _linearize(self, pair: _Pair, state: AlignmentState, scales: tuple[float, float]) -> LinearSystem:
-        config, reference = self._config, pair.reference
+        config = self._config
+        at = self._at(pair, state, scales)
+        return self._aligner.linearize(at, inlier_color=config.inlier_color, inlier_depth=config.inlier_depth)
+
+    def _at(self, pair: _Pair, state: AlignmentState, scales: tuple[float, float]) -> Linearization[Any]:
+        reference = pair.reference
         photometric_scale, depth_scale = self._weighted(pair, scales)
-        return self._aligner.linearize(
-            reference.brightness,
-            reference.depth,
-            pair.layers,
+        return Linearization(
             camera=reference.camera,
+            brightness=reference.brightness,
+            depth=reference.depth,
+            layers=pair.layers,
             color_motion=state.color_motion.astype(np.float32),
             depth_motion=state.depth_motion.astype(np.float32),
             velocity=state.velocity.astype(np.float32),
@@ -189,15 +210,12 @@ class GaussNewton:
             photometric_scale=photometric_scale,
             depth_scale=depth_scale,
             max_depth_ratio=2 * EDGE,
-            inlier_color=config.inlier_color,
-            inlier_depth=config.inlier_depth,
+            readout=(state.readout * state.velocity).astype(np.float32),
         )
 
-    def _time_offset_information(self, system: LinearSystem) -> float:
-        """Returns the inverse variance that the residuals claim for the time offset, the other unknowns marginalized."""
-        others = [unknown for unknown in self._free if unknown not in _TIME_OFFSET]
-        (t,), H = _TIME_OFFSET, system.H + np.diag(np.append(_PRIOR, 0.0))
-        return float(system.H[t, t] - H[t, others] @ np.linalg.solve(H[np.ix_(others, others)], H[others, t]))
+    def _unknowns(self, pair: _Pair) -> list[int]:
+        """Returns the indices of what is solved for."""
+        return self._free if pair.readout is None else [*self._free, *_READOUT]
 
     def _weighted(self, pair: _Pair, scales: tuple[float, float]) -> tuple[float, float]:
         """Returns the scales of the residuals of brightness and depth, divided by the roots of their weights."""
@@ -207,26 +225,17 @@ class GaussNewton:
         return color, depth
 
     def _weigh(self, pair: _Pair, state: AlignmentState, scales: tuple[float, float]) -> Evidence:
-        reference = pair.reference
-        photometric_scale, depth_scale = self._weighted(pair, scales)
-        sums = self._aligner.evidence(
-            reference.brightness,
-            reference.depth,
-            pair.layers,
-            camera=reference.camera,
-            color_motion=state.color_motion.astype(np.float32),
-            depth_motion=state.depth_motion.astype(np.float32),
-            velocity=state.velocity.astype(np.float32),
-            gain=state.gain,
-            bias=state.bias,
-            photometric_scale=photometric_scale,
-            depth_scale=depth_scale,
-            max_depth_ratio=2 * EDGE,
-            max_depth_error=max_depth_error(depth_scale),
-            step=step_of(reference.camera),
-        )
+        at = self._at(pair, state, scales)
+        sums = self._aligner.evidence(at, max_depth_error=max_depth_error(at.depth_scale), step=step_of(at.camera))
         prior = np.append(_PRIOR, pair.time_offset.information)
-        return weigh(sums, Knowns(reference.camera, state.velocity, prior, pair.time_offset.inflation, self._free))
+        return weigh(sums, Knowns(at.camera, state.velocity, prior, pair.time_offset.inflation, self._free))
+
+
+def _seen(equations: _Equations, state: AlignmentState, pair: _Pair, free: list[int]) -> ReadoutSeen | None:
+    """Returns what a frame alone tells about the readout; None if nothing."""
+    if pair.readout is None or not (information := equations.information(_READOUT[0], free)) > 0:
+        return None
+    return ReadoutSeen(state.readout + (state.readout - pair.readout.mean) * pair.readout.information / information, information)
 
 
 def _is_better(start: LinearSystem, found: LinearSystem) -> bool:
@@ -243,22 +252,56 @@ def _scales(system: LinearSystem) -> tuple[float, float]:
     )
 
 
-def _step(system: LinearSystem, state: AlignmentState, free: list[int], time_offset: TimeOffset) -> Matrix | None:
-    """Returns the step [9] of the free unknowns that minimises the residuals; None if they do not determine one.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Equations:
+    """The normal equations of all ten unknowns, the readout the last of them, without what is known before.
 
-    On a ramp of brightness a shift looks like a change of bias. The priors decide what the residuals leave open.
+    Attributes:
+        H: [10, 10].
+        g: [10].
+        prior: [10] inverse variances.
+        off: [10] by how much the state differs from what is known before.
+        num_seen: number of points.
     """
-    if system.seen < _MIN_POINTS:
-        return None
-    prior = np.append(_PRIOR, time_offset.information)
-    H, g = system.H + np.diag(prior), system.g.copy()
-    g[6:] += prior[6:] * (state.gain - 1, state.bias, state.time_offset - time_offset.mean)
-    step = np.zeros(len(g))
-    try:
-        step[free] = -np.linalg.solve(H[np.ix_(free, free)], g[free])
-    except np.linalg.LinAlgError:
-        return None
-    return step
+
+    H: Matrix
+    g: Matrix
+    prior: Matrix
+    off: Matrix
+    num_seen: int
+
+    @classmethod
+    def of(cls, system: LinearSystem, state: AlignmentState, pair: _Pair) -> _Equations:
+        """Returns those of a system. A point moves with the readout as with the time offset, times when its row is read."""
+        H, g, turn = np.zeros((10, 10)), np.zeros(10), state.velocity
+        H[:9, :9], g[:9] = system.H, system.g
+        readout = pair.readout or ReadoutSeen()
+        if pair.readout is not None:
+            H[:9, 9] = H[9, :9] = system.H_by_time[:, :6] @ turn
+            H[9, 9] = turn @ system.H_by_time_squared[:6, :6] @ turn
+            g[9] = turn @ system.g_by_time[:6]
+        prior = np.array([*_PRIOR, pair.time_offset.information, readout.information])
+        found = state.gain - 1, state.bias, state.time_offset - pair.time_offset.mean, state.readout - readout.mean
+        return cls(H, g, prior, np.array([0.0] * 6 + [*found]), system.seen)
+
+    def information(self, unknown: int, free: list[int]) -> float:
+        """Returns the inverse variance that the residuals claim for an unknown, the other free ones marginalized."""
+        others, H = [other for other in free if other != unknown], self.H + np.diag(self.prior)
+        return float(self.H[unknown, unknown] - H[unknown, others] @ np.linalg.solve(H[np.ix_(others, others)], H[others, unknown]))
+
+    def step(self, free: list[int]) -> Matrix | None:
+        """Returns the step [10] of the free unknowns that minimises the residuals; None if they do not determine one.
+
+        On a ramp of brightness a shift looks like a change of bias. The priors decide what the residuals leave open.
+        """
+        if self.num_seen < _MIN_POINTS:
+            return None
+        H, g, step = self.H + np.diag(self.prior), self.g + self.prior * self.off, np.zeros(10)
+        try:
+            step[free] = -np.linalg.solve(H[np.ix_(free, free)], g[free])
+        except np.linalg.LinAlgError:
+            return None
+        return step
 
 
 def _total_cost(system: LinearSystem, unseen_cost: float) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 
 from splatam_core.geometry import se3
 from splatam_core.geometry.se3 import Matrix
+from splatam_core.tracking.readout import Readout, ReadoutSeen
 from splatam_core.tracking.time_offset import TimeOffset
 
 MotionPrior = Callable[[int, int], 'Matrix | None']
@@ -43,6 +44,7 @@ class Prediction:
         is_guess: True if nothing is known about the motion since then.
         is_measured: True if another sensor has measured it.
         seen: what the images of the two frames tell about it; None where they were not compared.
+        readout: how long reading an image takes, as the frames before tell; None if they tell nothing.
     """
 
     T_world_cam: Matrix
@@ -51,6 +53,7 @@ class Prediction:
     is_guess: bool = False
     is_measured: bool = False
     seen: SeenMotion | None = None
+    readout: ReadoutSeen | None = None
 
     @property
     def T_cam_world(self) -> Matrix:
@@ -70,6 +73,7 @@ class MotionState:
         time_offset: between colour and depth.
         trusted_ns: stamp of the last pose that may be trusted; None where that is the last pose.
         T_world_cam_trusted: [4, 4] that pose.
+        readout: how long reading an image takes.
     """
 
     stamp_ns: int
@@ -79,6 +83,7 @@ class MotionState:
     time_offset: TimeOffset = TimeOffset()
     trusted_ns: int | None = None
     T_world_cam_trusted: Matrix = field(default_factory=lambda: np.eye(4))
+    readout: Readout = Readout()
 
 
 class MotionModel:
@@ -86,6 +91,7 @@ class MotionModel:
 
     Attributes:
         time_offset: between colour and depth, a property of the camera: it outlives a lost track.
+        readout: how long reading an image takes, another one.
 
     Args:
         constant_velocity: whether to extrapolate the velocity; else the prediction is the last pose.
@@ -102,6 +108,7 @@ class MotionModel:
         self._trusted_ns: int | None = None
         self._T_world_cam_trusted: Matrix = np.eye(4)
         self.time_offset = TimeOffset()
+        self.readout = Readout()
 
     @property
     def last_pose(self) -> Matrix:
@@ -123,6 +130,7 @@ class MotionModel:
             time_offset=self.time_offset,
             trusted_ns=self._trusted_ns,
             T_world_cam_trusted=self._T_world_cam_trusted,
+            readout=self.readout,
         )
 
     def restore(self, state: MotionState) -> None:
@@ -137,6 +145,7 @@ class MotionModel:
         self._stamp_ns, self._interval_ns = state.stamp_ns, state.interval_ns
         self._T_world_cam, self._velocity, self.time_offset = state.T_world_cam, state.velocity, state.time_offset
         self._trusted_ns, self._T_world_cam_trusted = state.trusted_ns, state.T_world_cam_trusted
+        self.readout = state.readout
 
     def predictions(self, stamp_ns: int) -> list[Prediction]:
         """Returns where the camera is expected: from the last pose, and if that is uncertain, from the last one to be trusted."""
@@ -149,10 +158,11 @@ class MotionModel:
         if not before_ns:
             return Prediction(T_before, T_before, math.inf)
         seconds = 1e-9 * (stamp_ns - before_ns)
+        readout = self.readout.prior(seconds)
         if self._prior and (step := self._prior(before_ns, stamp_ns)) is not None:
-            return Prediction(T_before @ step, T_before, seconds, is_measured=True)
+            return Prediction(T_before @ step, T_before, seconds, is_measured=True, readout=readout)
         is_guess = self._constant_velocity and not self._velocity.any()
-        return Prediction(self._extrapolated(stamp_ns, before_ns, T_before), T_before, seconds, is_guess)
+        return Prediction(self._extrapolated(stamp_ns, before_ns, T_before), T_before, seconds, is_guess, readout=readout)
 
     def predict(self, stamp_ns: int) -> Matrix:
         """Returns the predicted pose [4, 4], camera to world, at a stamp."""
@@ -163,13 +173,22 @@ class MotionModel:
         elapsed_ns = min(stamp_ns - before_ns, MAX_EXTRAPOLATION * self._interval_ns)
         return T_before @ se3.exp(self._velocity * elapsed_ns * 1e-9)
 
-    def observe(self, stamp_ns: int, T_world_cam: Matrix, *, is_trusted: bool = True) -> None:
-        """Records the pose of a frame. One that may be wrong is where the next prediction starts, but gives no velocity."""
+    def observe(self, stamp_ns: int, T_world_cam: Matrix, *, is_trusted: bool = True, readout: ReadoutSeen | None = None) -> None:
+        """Records the pose of a frame. One that may be wrong is where the next prediction starts, but gives no velocity.
+
+        Args:
+            stamp_ns: of the frame.
+            T_world_cam: [4, 4] its pose.
+            is_trusted: False if it may be wrong.
+            readout: what the frame tells about the time that reading an image takes.
+        """
         if not is_trusted:
             if self._trusted_ns is None:
                 self._trusted_ns, self._T_world_cam_trusted = self._stamp_ns, self._T_world_cam
             self._stamp_ns, self._T_world_cam = stamp_ns, T_world_cam
             return
+        if readout is not None and self._stamp_ns and self._trusted_ns is None:
+            self.readout = self.readout.updated(readout, 1e-9 * (stamp_ns - self._stamp_ns))
         if self._constant_velocity and self._stamp_ns:
             step = se3.log(se3.inverse(self._T_world_cam) @ T_world_cam)
             self._interval_ns = stamp_ns - self._stamp_ns

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.se3 import Matrix
-from splatam_core.tracking.aligner import Array, EvidenceSums
-from splatam_core.tracking.evidence import Linearization, summed
+from splatam_core.tracking.aligner import EvidenceSums, Linearization
+from splatam_core.tracking.evidence import summed
 
 _UNKNOWNS = 9
 _BINS = 1024  # of the histogram of absolute residuals, an eighth of an octave each
@@ -29,6 +29,9 @@ class TorchLinearSystem:
 
     H: Matrix
     g: Matrix
+    H_by_time: Matrix
+    H_by_time_squared: Matrix
+    g_by_time: Matrix
     cost: float
     points: int
     compared: int
@@ -64,34 +67,22 @@ class TorchAligner:
         is_surface = z.amax(dim=0) - z.amin(dim=0) <= max_step * mean
         return 0.25 * _blocks(brightness).sum(dim=0), torch.where(is_surface, mean, torch.nan)
 
-    def linearize(
-        self,
-        brightness: Tensor,
-        depth: Tensor,
-        layers: Tensor,
-        *,
-        camera: PinholeCamera,
-        color_motion: Array,
-        depth_motion: Array,
-        velocity: Array,
-        gain: float,
-        bias: float,
-        photometric_scale: float,
-        depth_scale: float,
-        max_depth_ratio: float,
-        inlier_color: float,
-        inlier_depth: float,
-    ) -> TorchLinearSystem:
+    def linearize(self, at: Linearization[Tensor], *, inlier_color: float, inlier_depth: float) -> TorchLinearSystem:
         """See ``Aligner.linearize``. The host waits for the device once, for the sums."""
-        given = np.concatenate([color_motion[:3].ravel(), depth_motion[:3].ravel(), velocity, [photometric_scale, depth_scale]])
-        numbers = torch.from_numpy(given.astype(np.float32)).to(depth.device, non_blocking=True)
-        motions, speed, scales = numbers[:24].view(2, 3, 4), numbers[24:30], numbers[30:, None]
-        intensity, known = brightness.flatten(), depth.flatten() > 0
-        moved = _Moved.of(_points(depth, camera), known, motions, camera)
-        value, along_u, along_v = _sampled(layers, moved).unbind(-1)  # [2, P] each
-        residuals = torch.stack([value[0] - (gain * intensity + bias), (value[1] - moved.z[1]) * moved.inverse_z[1]])
+        camera = at.camera
+        scales_at = [at.photometric_scale, at.depth_scale]
+        given = np.concatenate([at.color_motion[:3].ravel(), at.depth_motion[:3].ravel(), at.velocity, at.readout, scales_at])
+        numbers = torch.from_numpy(given.astype(np.float32)).to(at.depth.device, non_blocking=True)
+        motions, (speed, readout), scales = numbers[:24].view(2, 3, 4), numbers[24:36].view(2, 6), numbers[36:, None]
+        times = _times(at.depth)
+        intensity, known = at.brightness.flatten(), at.depth.flatten() > 0
+        moved = _Moved.of(
+            _carried(motions[:, :, :3] @ _points(at.depth, camera) + motions[:, :, 3:], readout, times), known, camera
+        )
+        value, along_u, along_v = _sampled(at.layers, moved).unbind(-1)  # [2, P] each
+        residuals = torch.stack([value[0] - (at.gain * intensity + at.bias), (value[1] - moved.z[1]) * moved.inverse_z[1]])
         compared = moved.inside[1] & ~value[1].isnan()
-        seen = moved.inside.all(dim=0) & (residuals[1].abs() < max_depth_ratio)  # False for NaN
+        seen = moved.inside.all(dim=0) & (residuals[1].abs() < at.max_depth_ratio)  # False for NaN
         unread = moved.inside[1] & value[1].isnan()  # colour needs the depth of the reference only
         used = torch.stack([(seen | unread) & moved.inside[0], seen])  # [2, P]
         tilt = torch.stack([along_u[1] * camera.fx, along_v[1] * camera.fy]) * moved.inverse_z[1]  # [2, P]
@@ -103,43 +94,11 @@ class TorchAligner:
         jacobian = _jacobian(moved, image_gradients, incidence_cosine, intensity, speed)
         counts = torch.stack([known, compared, seen, agree]).sum(dim=1)
         system = torch.where(used, jacobian, 0), residuals
-        return _summed(system, scales, counts, _medians(residuals, used), seen)
+        return _summed(system, scales, times, _Counted(counts, _medians(residuals, used), seen))
 
-    def evidence(
-        self,
-        brightness: Tensor,
-        depth: Tensor,
-        layers: Tensor,
-        *,
-        camera: PinholeCamera,
-        color_motion: Array,
-        depth_motion: Array,
-        velocity: Array,
-        gain: float,
-        bias: float,
-        photometric_scale: float,
-        depth_scale: float,
-        max_depth_ratio: float,
-        max_depth_error: float,
-        step: int,
-    ) -> EvidenceSums:
+    def evidence(self, at: Linearization[Tensor], *, max_depth_error: float, step: int) -> EvidenceSums:
         """See ``Aligner.evidence``. On the host."""
-        at = Linearization(
-            camera=camera,
-            brightness=brightness.numpy(force=True),
-            depth=depth.numpy(force=True),
-            layers=layers.numpy(force=True),
-            color_motion=color_motion.astype(np.float64),
-            depth_motion=depth_motion.astype(np.float64),
-            velocity=velocity.astype(np.float64),
-            gain=gain,
-            bias=bias,
-            scales=(photometric_scale, depth_scale),
-            max_depth_ratio=max_depth_ratio,
-            max_depth_error=max_depth_error,
-            step=step,
-        )
-        return summed(at)
+        return summed(at.converted(lambda image: image.numpy(force=True)), max_depth_error, step)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,9 +114,9 @@ class _Moved:
     inside: Tensor
 
     @classmethod
-    def of(cls, points: Tensor, known: Tensor, motions: Tensor, camera: PinholeCamera) -> _Moved:
-        """Moves points [3, P] by motions [2, 3, 4]."""
-        x, y, z = (motions[:, :, :3] @ points + motions[:, :, 3:]).unbind(1)
+    def of(cls, points: Tensor, known: Tensor, camera: PinholeCamera) -> _Moved:
+        """Projects points [2, 3, P]."""
+        x, y, z = points.unbind(1)
         inverse_z = 1 / z
         u, v = camera.fx * x * inverse_z + camera.cx, camera.fy * y * inverse_z + camera.cy
         inside = known & (z > 0) & (u >= 0) & (v >= 0) & (u < camera.width - 1) & (v < camera.height - 1)
@@ -187,6 +146,20 @@ def _points(depth: Tensor, camera: PinholeCamera) -> Tensor:
     columns = (torch.arange(depth.shape[1], device=depth.device, dtype=depth.dtype) - camera.cx) / camera.fx
     rows = (torch.arange(depth.shape[0], device=depth.device, dtype=depth.dtype) - camera.cy) / camera.fy
     return torch.stack([columns * depth, rows[:, None] * depth, depth]).flatten(1)
+
+
+def _times(depth: Tensor) -> Tensor:
+    """Returns [H * W] when the pixels are read: -0.5 in the first row to 0.5 in the last."""
+    height, width = depth.shape
+    times = torch.arange(height, device=depth.device, dtype=depth.dtype) / max(1, height - 1) - 0.5 * (height > 1)
+    return times.repeat_interleave(width)
+
+
+def _carried(points: Tensor, twist: Tensor, times: Tensor) -> Tensor:
+    """Moves points [2, 3, P] on by a twist [6] per unit of time, for times [P]; to second order, as ``csrc/readout.hpp`` does."""
+    turn = twist[3:, None].expand(3, points.shape[2])[None].expand_as(points)
+    speed = torch.linalg.cross(turn, points, dim=1) + twist[:3, None]
+    return points + times * (speed + 0.5 * times * torch.linalg.cross(turn, speed, dim=1))
 
 
 def _sampled(layers: Tensor, moved: _Moved) -> Tensor:
@@ -231,20 +204,34 @@ def _medians(residuals: Tensor, used: Tensor) -> Tensor:
     return torch.where(counted[:, -1] > 0, edges, torch.nan)
 
 
-def _summed(system: tuple[Tensor, Tensor], scales: Tensor, counts: Tensor, medians: Tensor, is_seen: Tensor) -> TorchLinearSystem:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Counted:
+    """Counts [4], medians [2], and which points are seen [P]."""
+
+    counts: Tensor
+    medians: Tensor
+    is_seen: Tensor
+
+
+def _summed(system: tuple[Tensor, Tensor], scales: Tensor, times: Tensor, counted: _Counted) -> TorchLinearSystem:
     """Returns the sums, brought to the host in one transfer. Weights: Student's t with five degrees of freedom."""
     (jacobian, residuals), precisions = system, 1 / (scales * scales)
     squared = residuals * residuals * precisions
     weighted = (jacobian * (6 / (5 + squared) * precisions)).flatten(1)
-    H, g = weighted @ jacobian.flatten(1).T, weighted @ residuals.flatten()
-    cost = torch.where(is_seen, squared / (5 + squared), 0).sum()
-    sums = torch.cat([H.flatten(), g, cost[None], medians, counts.float()]).numpy(force=True).astype(np.float64)
-    matrix, vector, (total, *middles), tallies = np.split(sums, np.cumsum([_UNKNOWNS**2, _UNKNOWNS, 3]))
+    both, by_time = torch.cat([jacobian.flatten(1), residuals.flatten()[None]]).T, weighted * times.repeat(2)
+    products = torch.stack([weighted @ both, by_time @ both, (by_time * times.repeat(2)) @ both])  # [3, 9, 10]
+    cost = torch.where(counted.is_seen, squared / (5 + squared), 0).sum()
+    sums = torch.cat([products.flatten(), cost[None], counted.medians, counted.counts.float()]).numpy(force=True).astype(np.float64)
+    matrices, (total, *middles), tallies = np.split(sums, np.cumsum([3 * _UNKNOWNS * (_UNKNOWNS + 1), 3]))
+    moments = matrices.reshape(3, _UNKNOWNS, _UNKNOWNS + 1)
     points, compared, seen, agreeing = map(int, tallies)
     photometric_median, depth_median = map(float, middles)
     return TorchLinearSystem(
-        H=matrix.reshape(_UNKNOWNS, _UNKNOWNS),
-        g=vector,
+        H=moments[0, :, :-1],
+        g=moments[0, :, -1],
+        H_by_time=moments[1, :, :-1],
+        H_by_time_squared=moments[2, :, :-1],
+        g_by_time=moments[1, :, -1],
         cost=float(total),
         points=points,
         compared=compared,

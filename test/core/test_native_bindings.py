@@ -6,7 +6,9 @@ import os
 import subprocess
 import sys
 import textwrap
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from splatam_core import _native
 from splatam_core.errors import RasterizerError
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.rasterizer import Gaussians, Moments, Rates, Target, make_rasterizer
+from splatam_core.tracking.aligner import Linearization
 
 N, WIDTH, HEIGHT = 5, 16, 8
 CAMERA = PinholeCamera(WIDTH, HEIGHT, 14.0, 14.0, 7.5, 3.5)
@@ -63,22 +66,21 @@ def fit(**changed: object) -> None:
     _native.Engine(1).fit(**(arguments | changed))
 
 
-def linearize(**changed: object) -> None:
+def linearization(**changed: object) -> Linearization:
     arguments = {
         'brightness': floats(HEIGHT, WIDTH), 'depth': floats(HEIGHT, WIDTH), 'layers': floats(HEIGHT, WIDTH, 8), 'camera': CAMERA,
         'color_motion': POSE, 'depth_motion': POSE, 'velocity': floats(6), 'gain': 1.0, 'bias': 0.0, 'photometric_scale': 0.1,
-        'depth_scale': 0.1, 'max_depth_ratio': 0.1, 'inlier_color': 0.1, 'inlier_depth': 0.1,
+        'depth_scale': 0.1, 'max_depth_ratio': 0.1, 'readout': floats(6),
     }  # fmt: skip
-    _native.Aligner(1).linearize(**(arguments | changed))
+    return Linearization(**(arguments | changed))
+
+
+def linearize(**changed: object) -> None:
+    _native.Aligner(1).linearize(linearization(**changed), inlier_color=0.1, inlier_depth=0.1)
 
 
 def evidence(**changed: object) -> None:
-    arguments = {
-        'brightness': floats(HEIGHT, WIDTH), 'depth': floats(HEIGHT, WIDTH), 'layers': floats(HEIGHT, WIDTH, 8), 'camera': CAMERA,
-        'color_motion': POSE, 'depth_motion': POSE, 'velocity': floats(6), 'gain': 1.0, 'bias': 0.0, 'photometric_scale': 0.1,
-        'depth_scale': 0.1, 'max_depth_ratio': 0.1, 'max_depth_error': 0.1, 'step': 2,
-    }  # fmt: skip
-    _native.Aligner(1).evidence(**(arguments | changed))
+    _native.Aligner(1).evidence(linearization(**changed), max_depth_error=0.1, step=2)
 
 
 def halve(**changed: object) -> None:
@@ -110,8 +112,8 @@ CALLS = {
     | {f'{name}_gradient': shape for name, shape in GAUSSIANS.items()}
     | {'pose_gradient': (4, 4), 'images_at_0': IMAGE, 'images_at_1': PLANE, 'image_gradients_at_2': PLANE},
     fit: GAUSSIANS | {'bounds': (1, 7), 'moments': (N, 16), 'target_depth': PLANE},
-    linearize: {'brightness': PLANE, 'depth': PLANE, 'layers': (HEIGHT, WIDTH, 8), 'velocity': (6,)},
-    evidence: {'brightness': PLANE, 'depth': PLANE, 'layers': (HEIGHT, WIDTH, 8), 'velocity': (6,)},
+    linearize: {'brightness': PLANE, 'depth': PLANE, 'layers': (HEIGHT, WIDTH, 8), 'velocity': (6,), 'readout': (6,)},
+    evidence: {'brightness': PLANE, 'depth': PLANE, 'layers': (HEIGHT, WIDTH, 8), 'velocity': (6,), 'readout': (6,)},
     halve: {'brightness': PLANE, 'depth': PLANE},
     blend: {'shapes': (N, 6), 'features': (N, 4), 'image': (5, HEIGHT, WIDTH)},
     blend_back: {
@@ -169,6 +171,16 @@ def test_poses_are_checked(call: object, pose: object) -> None:
     with pytest.raises(TypeError, match='T_cam_world'):
         call(T_cam_world=pose)
     call(T_cam_world=np.asfortranarray(POSE))  # the only array that may have any strides
+
+
+@pytest.mark.parametrize('call', [linearize, evidence])
+def test_what_is_no_linearization_is_refused(call: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (('gain', 'text'), ('depth_scale', None), ('camera', 3), ('color_motion', np.eye(4))):
+        with pytest.raises(TypeError, match=name):
+            call(**{name: value})
+    monkeypatch.setitem(globals(), 'linearization', lambda: SimpleNamespace(brightness=floats(HEIGHT, WIDTH)))
+    with pytest.raises(TypeError, match='at has no depth; expected a Linearization'):
+        call()
 
 
 def test_a_depth_of_another_size_than_the_image_is_refused() -> None:

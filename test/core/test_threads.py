@@ -20,6 +20,7 @@ from splatam_core.maps.ply import write_ply
 from splatam_core.rasterizer import Moments, Rates, Target, make_rasterizer
 from splatam_core.rasterizer.native import make_native_aligner
 from splatam_core.slam import Slam
+from splatam_core.tracking.aligner import Linearization
 from splatam_core.types import FrameResult, RgbdFrame, Status
 from splatam_core.worker import SlamWorker
 
@@ -70,15 +71,17 @@ def aligned(threads: int) -> Arrays:
     depth[rng.random((HEIGHT, WIDTH)) < 0.05] = np.nan
     layers, motion = aligner.layers(brightness, depth, 0.05), np.eye(4, dtype=np.float32)
     motion[:3, 3] = 0.01, -0.02, 0.005
-    system = aligner.linearize(
-        brightness, depth, layers, camera=scene(1).camera, color_motion=motion, depth_motion=motion,
+    at = Linearization(
+        camera=scene(1).camera, brightness=brightness, depth=depth, layers=layers, color_motion=motion, depth_motion=motion,
         velocity=np.full(6, 0.01, np.float32), gain=1.1, bias=0.05, photometric_scale=0.1, depth_scale=0.01, max_depth_ratio=0.1,
-        inlier_color=0.3, inlier_depth=0.02,
+        readout=np.full(6, 0.02, np.float32),
     )  # fmt: skip
+    system = aligner.linearize(at, inlier_color=0.3, inlier_depth=0.02)
     numbers = [system.cost, system.points, system.compared, system.seen, system.agreeing]
     numbers += [system.photometric_median, system.depth_median]
     return [
-        system.H, system.g, np.array(numbers), layers, *aligner.halve(brightness, depth, 0.05), aligner.fill_holes(depth, 4, 0.05)
+        system.H, system.g, system.H_by_time, system.H_by_time_squared, system.g_by_time, np.array(numbers), layers,
+        *aligner.halve(brightness, depth, 0.05), aligner.fill_holes(depth, 4, 0.05),
     ]  # fmt: skip
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import cv2
@@ -21,15 +21,17 @@ from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.rasterizer.native import make_native_aligner
 from splatam_core.slam import Slam
 from splatam_core.tracking import TorchAligner, alignment, make_tracker
-from splatam_core.tracking.aligner import EvidenceSums
+from splatam_core.tracking.aligner import EvidenceSums, Linearization
 from splatam_core.tracking.evidence import step_of
 from splatam_core.tracking.torch_aligner import TorchLinearSystem
 from splatam_core.tracking.verdict import verify
 
 EDGE = 0.05
+INLIERS = {'inlier_color': 0.2, 'inlier_depth': 0.1}
 Image = np.ndarray
 TWIST = np.array([0.01, -0.02, 0.01, 0.003, 0.005, -0.004])
 VELOCITY = np.array([0.02, 0.01, -0.01, 0.01, 0.02, 0.003], np.float32)
+AT_ONCE, ROLLING = np.zeros(6, np.float32), np.array([0.01, -0.02, 0.01, 0.04, 0.05, -0.03], np.float32)
 
 
 def _picture(seed: int, size: tuple[int, int]) -> tuple[Image, Image]:
@@ -47,17 +49,27 @@ def _camera(size: tuple[int, int]) -> PinholeCamera:
     return PinholeCamera(width, height, 0.9 * width, 0.91 * width, width / 2 - 0.4, height / 2 - 0.6)
 
 
-def _settings(color_motion: np.ndarray, depth_motion: np.ndarray, gain: float = 1.0, bias: float = 0.0) -> dict[str, Any]:
-    """The arguments of ``linearize`` but images and camera."""
+def _settings(
+    color_motion: np.ndarray, depth_motion: np.ndarray, gain: float = 1.0, bias: float = 0.0, readout: np.ndarray = AT_ONCE
+) -> dict[str, Any]:
+    """The fields of a ``Linearization`` but images and camera."""
     return {
         'color_motion': color_motion.astype(np.float32), 'depth_motion': depth_motion.astype(np.float32), 'velocity': VELOCITY,
-        'gain': gain, 'bias': bias, 'photometric_scale': 0.03, 'depth_scale': 0.01, 'max_depth_ratio': 0.1, 'inlier_color': 0.2,
-        'inlier_depth': 0.1,
+        'gain': gain, 'bias': bias, 'photometric_scale': 0.03, 'depth_scale': 0.01, 'max_depth_ratio': 0.1, 'readout': readout,
     }  # fmt: skip
+
+
+def _at(images: Sequence[Any], layers: Any, **settings: Any) -> Linearization[Any]:
+    brightness, depth = images
+    return Linearization(brightness=brightness, depth=depth, layers=layers, **settings)
 
 
 def _tensors(*images: Image) -> list[torch.Tensor]:
     return [torch.from_numpy(image) for image in images]
+
+
+def _on_device(at: Linearization[Any]) -> Linearization[Any]:
+    return at.converted(torch.from_numpy)
 
 
 @pytest.mark.parametrize('size', [(48, 65), (37, 40), (2, 2), (1, 5)])
@@ -100,20 +112,21 @@ def test_colour_is_compared_where_the_frame_has_no_depth() -> None:
     native = make_native_aligner(1)
     settings = _settings(np.eye(4), np.eye(4)) | {'camera': _camera(size)}
     half, full = (
-        native.linearize(*reference, native.layers(reference[0], depth, EDGE), **settings) for depth in (frame_depth, reference[1])
+        native.linearize(_at(reference, native.layers(reference[0], depth, EDGE), **settings), **INLIERS)
+        for depth in (frame_depth, reference[1])
     )
     assert half.compared < 0.55 * full.compared and half.seen == half.compared
     assert half.H[7, 7] == pytest.approx(full.H[7, 7], rel=0.02)  # bias: the weights of colour alone; the border differs
     assert half.H[2, 2] < 0.6 * full.H[2, 2]  # along the axis depth says most, and half of it is missing
 
 
-@pytest.mark.parametrize('time_offset', [0.0, 0.3])
+@pytest.mark.parametrize(('time_offset', 'readout'), [(0.0, AT_ONCE), (0.3, AT_ONCE), (0.3, ROLLING)], ids=str)
 @pytest.mark.parametrize('size', [(48, 65), (120, 160)])
 @pytest.mark.parametrize('isa', ['generic', 'avx2', 'avx512'])
 def test_linear_system_is_the_native_one(
-    isa: str, size: tuple[int, int], time_offset: float, monkeypatch: pytest.MonkeyPatch
+    isa: str, size: tuple[int, int], time_offset: float, readout: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With NaN depth, steps, another exposure, and a time offset between colour and depth; by every instruction set there is.
+    """With NaN depth, steps, another exposure, a time offset, and a rolling shutter; by every instruction set there is.
 
     Sums of float32 against sums of doubles over up to 19 200 pixels: 1e-5 of the largest entry. Counts may differ by the few
     points that fall on a limit, and medians by a bin (an eighth of an octave) where many lie around its edge.
@@ -126,10 +139,11 @@ def test_linear_system_is_the_native_one(
     native, ours = make_native_aligner(1), TorchAligner()
     motion = se3.exp(TWIST)
     color_motion = se3.exp(time_offset * VELOCITY.astype(np.float64)) @ motion
-    settings = _settings(color_motion, motion, gain=1.05, bias=-0.02) | {'camera': _camera(size)}
-    expected = native.linearize(*reference, native.layers(*frame, EDGE), **settings)
-    found = ours.linearize(*_tensors(*reference), ours.layers(*_tensors(*frame), EDGE), **settings)
-    for a, b in ((found.H, expected.H), (found.g, expected.g)):
+    settings = _settings(color_motion, motion, gain=1.05, bias=-0.02, readout=readout) | {'camera': _camera(size)}
+    expected = native.linearize(_at(reference, native.layers(*frame, EDGE), **settings), **INLIERS)
+    found = ours.linearize(_at(_tensors(*reference), ours.layers(*_tensors(*frame), EDGE), **settings), **INLIERS)
+    for name in ('H', 'g', 'H_by_time', 'H_by_time_squared', 'g_by_time'):
+        a, b = getattr(found, name), getattr(expected, name)
         assert a.shape == b.shape and np.abs(a - b).max() < 1e-5 * np.abs(b).max()
     assert found.cost == pytest.approx(expected.cost, rel=1e-4)
     assert found.points == expected.points
@@ -140,18 +154,20 @@ def test_linear_system_is_the_native_one(
     assert found.depth_median == pytest.approx(expected.depth_median, rel=0.13)
 
 
-@pytest.mark.parametrize('time_offset', [0.0, 0.3])
+@pytest.mark.parametrize(('time_offset', 'readout'), [(0.0, AT_ONCE), (0.3, AT_ONCE), (0.3, ROLLING)], ids=str)
 @pytest.mark.parametrize('size', [(48, 65), (120, 160), (7, 9)])
-def test_evidence_is_the_native_one(size: tuple[int, int], time_offset: float) -> None:
+def test_evidence_is_the_native_one(size: tuple[int, int], time_offset: float, readout: np.ndarray) -> None:
     """To the rounding of sums of float32; with any number of threads the same."""
     (brightness, z), camera, depth_motion = _picture(1, size), _camera(size), se3.exp(TWIST)
     color_motion = se3.exp(time_offset * VELOCITY.astype(np.float64)) @ depth_motion if time_offset else depth_motion
-    settings = _settings(color_motion, depth_motion, 1.05, 0.01) | {'max_depth_error': 0.03, 'step': step_of(camera)}
-    settings = {name: value for name, value in settings.items() if not name.startswith('inlier')}
+    settings, sampling = (
+        _settings(color_motion, depth_motion, 1.05, 0.01, readout),
+        {'max_depth_error': 0.03, 'step': step_of(camera)},
+    )
     native, threaded = make_native_aligner(1), make_native_aligner(3)
-    images = brightness, z, native.layers(brightness + np.float32(0.02), 1.002 * z, EDGE)
-    expected = TorchAligner().evidence(*_tensors(*images), camera=camera, **settings)
-    found, again = (aligner.evidence(*images, camera=camera, **settings) for aligner in (native, threaded))
+    at = _at((brightness, z), native.layers(brightness + np.float32(0.02), 1.002 * z, EDGE), camera=camera, **settings)
+    expected = TorchAligner().evidence(_on_device(at), **sampling)
+    found, again = (aligner.evidence(at, **sampling) for aligner in (native, threaded))
     assert expected.cells[0].sum() > 0.3 * expected.cells[1].sum() > 0
     for name in ('claimed', 'shared', 'scores', 'cells'):
         ours, theirs = getattr(found, name), getattr(expected, name)
@@ -167,7 +183,7 @@ def test_nothing_in_sight_gives_an_empty_system() -> None:
         tensors = _tensors(brightness, z)
         layers = ours.layers(*_tensors(brightness, depth), EDGE)
         camera = PinholeCamera(50, 40, 45.0, 45.0, 24.0, 19.0)
-        system = ours.linearize(*tensors, layers, camera=camera, **_settings(motion, motion))
+        system = ours.linearize(_at(tensors, layers, camera=camera, **_settings(motion, motion)), **INLIERS)
         assert not system.H.any() and not system.g.any() and system.cost == 0
         assert system.points == (z > 0).sum() and system.compared == system.seen == system.agreeing == 0
         assert np.isnan([system.photometric_median, system.depth_median]).all()
@@ -214,8 +230,8 @@ class _Bridge:
     def halve(self, brightness: Image, depth: Image, max_step: float) -> tuple[Image, ...]:
         return tuple(image.numpy() for image in self._aligner.halve(*_tensors(brightness, depth), max_step))
 
-    def evidence(self, brightness: Image, depth: Image, layers: Image, **settings: Any) -> EvidenceSums:
-        return self._aligner.evidence(*_tensors(brightness, depth, layers), **settings)
+    def evidence(self, at: Linearization[Any], **settings: Any) -> EvidenceSums:
+        return self._aligner.evidence(_on_device(at), **settings)
 
-    def linearize(self, brightness: Image, depth: Image, layers: Image, **settings: Any) -> TorchLinearSystem:
-        return self._aligner.linearize(*_tensors(brightness, depth, layers), **settings)
+    def linearize(self, at: Linearization[Any], **settings: Any) -> TorchLinearSystem:
+        return self._aligner.linearize(_on_device(at), **settings)

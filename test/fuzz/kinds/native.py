@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from kinds.base import Case, Kind, Tally
 from splatam_core import _native
+from splatam_core.tracking.aligner import Linearization
 
 REFUSED = (TypeError, ValueError)  # as the bindings document; TooLargeError is a ValueError
 ODD = np.float32([np.nan, np.inf, -np.inf, 0.0, -0.0, 1e38, -1e38, 1e-40, 88.8, -104.0, 3e9, 1e-7])
@@ -191,9 +192,10 @@ def linearize(values: Values, tally: Tally) -> None:
         'brightness': brightness, 'depth': depth, 'layers': layers, 'camera': values.camera(), 'color_motion': values.pose(),
         'depth_motion': values.pose(), 'velocity': values.floats(6, low=-1), 'gain': values.scalar(1.0), 'bias': values.scalar(0.0),
         'photometric_scale': values.scalar(0.1), 'depth_scale': values.scalar(0.1), 'max_depth_ratio': values.scalar(0.1),
-        'inlier_color': values.scalar(0.1), 'inlier_depth': values.scalar(0.1),
+        'readout': values.floats(6, low=-1),
     })  # fmt: skip
-    system = tally.attempt(partial(aligner.linearize, **arguments), *REFUSED)
+    inliers = {name: values.scalar(0.1) for name in ('inlier_color', 'inlier_depth')}
+    system = tally.attempt(partial(aligner.linearize, Linearization(**arguments), **inliers), *REFUSED)
     if system is None:
         return
     assert 0 <= system.agreeing <= system.compared and 0 <= system.seen <= system.points <= brightness.size
