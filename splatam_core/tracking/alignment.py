@@ -36,9 +36,10 @@ from splatam_core.tracking.pyramid import Level, frame_level, full_pyramid, half
 from splatam_core.tracking.readout import ReadoutSeen
 from splatam_core.tracking.time_offset import TimeOffset
 from splatam_core.tracking.torch_aligner import TorchAligner
-from splatam_core.tracking.verdict import verify
+from splatam_core.tracking.verdict import better, verify
 
 _LEAST_ERROR_PX = 0.1  # of the motion between two images, along and about each axis: interpolation is no better
+_FAR = 0.05  # m and rad: alignment that has come so far may have found another minimum, and features are asked, too
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,10 +89,10 @@ class AlignmentTracker:
         pyramid = half_pyramid(frame_level(view, self._aligner), self._aligner)
         frame = _Frame(view, pyramid, gaussians, T_cam_world_before, time_offset or TimeOffset(), readout)
         found = self._align_twice(frame, T_cam_world)
-        if self._is_good(found) or not self._config.align.features:
+        if not self._config.align.features or (self._is_good(found) and not _is_far(found, T_cam_world)):
             return found
         start = self._pose_by_features(frame, T_cam_world if T_cam_world_before is None else T_cam_world_before)
-        return found if start is None else self._better(found, self._align_twice(frame, start))
+        return found if start is None else better(found, self._align_twice(frame, start), self._config)
 
     def motion(self, view: View, before: View, T_now_before: Matrix) -> SeenMotion | None:
         """See ``Tracker.motion``."""
@@ -156,6 +157,11 @@ class AlignmentTracker:
     def _better(self, first: TrackingResult, second: TrackingResult) -> TrackingResult:
         """Returns the result that is not lost and has more inliers; the first one of two equals."""
         return max(first, second, key=lambda result: (not verify(result, self._config), result.inlier_fraction))
+
+
+def _is_far(found: TrackingResult, T_cam_world: Matrix) -> bool:
+    """Returns whether a pose is far from where alignment began."""
+    return bool(np.linalg.norm(se3.log(found.T_cam_world_depth @ se3.inverse(T_cam_world)).reshape(2, 3), axis=1).max() > _FAR)
 
 
 def make_aligner(threads: int, device: torch.device) -> Aligner[Any]:

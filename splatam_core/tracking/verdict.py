@@ -39,6 +39,7 @@ _FINE_PIXEL_RAD = 0.01  # wider pixels leave more open: at half size, those of i
 _SURE = 0.5  # of the error allowed: the map alone is sure enough
 _WEAK = 0.75  # of the error allowed: beyond, the last frame is asked as well
 _ALIKE = 10  # frames in a row whose errors in a weak part of the map are the same one: together they count once
+_CONTRADICTION = 3.0  # standard deviations along each axis by which map and motion differ where one of them is wrong
 _REENTRY = 0.9  # after a frame in doubt, the next must be so much surer to be trusted
 _JUMP_DEVIATIONS = 5.0
 _LEARNING_RATE = 0.1
@@ -278,7 +279,10 @@ class Judge:
             by_images = prediction.seen.T_now_before @ se3.inverse(prediction.T_world_cam_before)
             moved, unseen = gain @ se3.log(by_images @ prediction.T_world_cam), np.eye(6) - gain
             in_map = _ALIKE * in_map
-        gain, covariance = _updated(self.state.covariance + noise, in_map)
+        expected, off = self.state.covariance + noise, step - moved
+        if off @ np.linalg.solve(expected + in_map, off) > 6 * _CONTRADICTION**2:
+            return _Blend.of_found(step, evidence.covariance)  # one of the two is wrong, and no mean of them is right
+        gain, covariance = _updated(expected, in_map)
         kept = np.eye(6) - gain
         return _Blend(
             found=step,

@@ -36,6 +36,7 @@ PRESET_THEN: dict[str, dict[str, object]] = {
         'densification.depth_noise_ratio': 0.0,
         'tracking.silhouette_threshold': 0.99,
         'mapping.max_gaussians': 0,
+        'mapping.fused.final_passes': 12,
         'tracking.align.relocalisation.enabled': False,
     }
 }

@@ -94,7 +94,7 @@ def test_a_system_that_cannot_be_solved_costs_at_most_the_frame(
     for frame in there_and_back[:2]:
         slam.process(frame)
 
-    def unsolvable(*arguments: object) -> None:
+    def unsolvable(*arguments: object, **options: object) -> None:
         raise np.linalg.LinAlgError('Singular matrix')
 
     with monkeypatch.context() as patch:

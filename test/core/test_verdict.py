@@ -165,6 +165,16 @@ def test_motion_that_is_seen_carries_the_camera_over_a_poor_map(bench: Bench) ->
         assert abs(off) < 0.01  # the map's variance is some thousand times larger, in each of twenty frames
 
 
+def test_where_map_and_motion_contradict_each_other_no_mean_of_them_is_taken(bench: Bench) -> None:
+    """After a jump the motion between two frames may be seen wrongly. A mean of both is nowhere, and the next frame begins there."""
+    verdict = bench.feed(result(at(HERE + 0.6), deviation=0.01), seen=SEEN)
+    assert verdict.status is Status.UNCERTAIN
+    np.testing.assert_allclose(bench.motion.last_pose, at(HERE + 0.6), atol=1e-12)
+    next_one = at(HERE + 0.6 + STEP)
+    verdict = bench.feed(result(next_one), result(next_one), seen=SEEN)
+    assert verdict.status is Status.TRACKED and verdict.corrects
+
+
 def test_motion_that_the_images_leave_open_changes_nothing(bench: Bench) -> None:
     """A blank wall: neither the map nor the frame before tells where the camera went."""
     found = result(at(HERE + STEP), deviation=0.1)

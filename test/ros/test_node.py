@@ -381,9 +381,9 @@ SAYS_WHEN_IT_TRACKS = """
 import sys
 from splatam_core.tracking.render_and_compare import RenderAndCompareTracker
 works = RenderAndCompareTracker.track
-def track(*arguments):
+def track(*arguments, **options):
     print('tracking begins', flush=True)
-    return works(*arguments)
+    return works(*arguments, **options)
 RenderAndCompareTracker.track = track
 from splatam_ros.node.main import main
 sys.exit(main(sys.argv[1:]))
