@@ -166,7 +166,7 @@ def test_motion_that_is_seen_carries_the_camera_over_a_poor_map(bench: Bench) ->
 
 
 def test_where_map_and_motion_contradict_each_other_no_mean_of_them_is_taken(bench: Bench) -> None:
-    """After a jump the motion between two frames may be seen wrongly. A mean of both is nowhere, and the next frame begins there."""
+    """After a jump the motion may be seen wrongly. A mean of both is nowhere, and the next frame begins there."""
     verdict = bench.feed(result(at(HERE + 0.6), deviation=0.01), seen=SEEN)
     assert verdict.status is Status.UNCERTAIN
     np.testing.assert_allclose(bench.motion.last_pose, at(HERE + 0.6), atol=1e-12)
