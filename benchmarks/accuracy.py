@@ -1,7 +1,7 @@
 """Accuracy of a preset on many recordings, beside Open3D's dense SLAM and OpenCV's RGB-D odometry on the same frames.
 
     python benchmarks/accuracy.py [RECORDING ...] [--runs 5] [--systems realtime,open3d,opencv] [--width 320] [--data DIR]
-                                  [--out out/benchmarks/accuracy] [--limit-s 280] [--plots docs/images]
+                                  [--out out/benchmarks/accuracy] [--limit-s 280] [--plots docs/images] [--html FILE]
 
 RECORDING is a folder in DIR, or FOLDER:START:END for some of its frames; without any, all recordings of DIR that are 320 pixels
 wide are taken. Run k of a preset has seed k and one thread, so that it can be repeated bit for bit on the same kind of processor;
@@ -35,6 +35,7 @@ from splatam_core.config import apply_threads, load_config
 from splatam_core.datasets.base import Sequence as Recording
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.evaluation.calibration import TruthNoise, normalized_errors
+from splatam_core.evaluation.report.tables import Table, page
 from splatam_core.evaluation.trajectory import falsely_tracked, relative_pose_errors, trajectory_error
 from splatam_core.geometry import se3
 from splatam_core.geometry.trajectory import Trajectory, interpolate_poses
@@ -193,8 +194,8 @@ def step_errors(estimate: Trajectory, ground_truth: Trajectory) -> dict[int, flo
     return dict(zip(estimate.stamps_ns[1:][both].tolist(), errors[both].tolist()))
 
 
-def row(job: Job, outcomes: list[Outcome]) -> str:
-    """Returns a line of the table."""
+def row(job: Job, outcomes: list[Outcome]) -> list[str]:
+    """Returns the cells of a line of the table."""
 
     def spread(of: Callable[[Outcome], float], digits: int) -> str:
         values = sorted(map(of, outcomes))
@@ -203,15 +204,14 @@ def row(job: Job, outcomes: list[Outcome]) -> str:
 
     counts = ('uncertain', 'lost', 'longest', 'false')
     is_peer = job.system in PEERS
-    cells = [
-        job.title, f'`{job.system}`', str(len(outcomes)), str(outcomes[0].frames),
+    return [
+        job.title, job.system, str(len(outcomes)), str(outcomes[0].frames),
         *('–' if is_peer and count == 'false' else str(max(getattr(o, count) for o in outcomes)) for count in counts),
         spread(lambda o: 100 * o.ate_m, 2), '–' if is_peer else spread(lambda o: 100 * o.ate_tracked_m, 2),
         spread(lambda o: 100 * o.worst_m, 1), '–' if is_peer else spread(lambda o: 100 * o.worst_tracked_m, 1),
         spread(lambda o: 1000 * o.rpe_m, 1), spread(lambda o: o.rpe_deg, 2),
         '–' if is_peer else spread(lambda o: o.deviations or 0.0, 2), '–' if is_peer else spread(lambda o: o.num_gaussians, 0),
     ]  # fmt: skip
-    return '| ' + ' | '.join(cells) + ' |'
 
 
 def plot(path: Path, title: str, outcomes: dict[str, Outcome]) -> None:
@@ -262,6 +262,7 @@ def main() -> None:
     parser.add_argument('--out', type=Path, default=Path('out/benchmarks/accuracy'))
     parser.add_argument('--limit-s', type=float, default=float('inf'))
     parser.add_argument('--plots', type=Path)
+    parser.add_argument('--html', type=Path, help='write the table as a page, too')
     parser.add_argument('--set', dest='overrides', action='append', default=[], metavar='KEY=VALUE')
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
@@ -276,16 +277,20 @@ def main() -> None:
     outcomes = {job: Outcome(**json.loads((args.out / f'{job.file_name}.json').read_text())) for job in jobs}
     print_header(f'Accuracy, width {args.width}, one thread', args.runs)
     print(f'Results of commit {", ".join(sorted({found.commit[:10] for found in outcomes.values()}))}.\n')
-    print('| ' + ' | '.join(COLUMNS) + ' |\n|' + '---|' * len(COLUMNS))
+    rows = []
     for recording in args.recordings:
         middle = {}
         for system in systems:
             runs = [outcomes[job] for job in jobs if (job.recording, job.system) == (recording, system)]
-            print(row(Job(recording, system, 0), runs))
+            rows.append(row(Job(recording, system, 0), runs))
             middle[system] = sorted(runs, key=lambda found: found.ate_m)[len(runs) // 2]
         if args.plots:
             job = Job(recording, '', 0)
             plot(args.plots / f'accuracy_{recording.replace(":", "_")}.png', job.title, middle)
+    table = Table('', COLUMNS, rows)
+    print(table.markdown())
+    if args.html:
+        args.html.write_text(page('Accuracy', f'width {args.width}, one thread, runs: {args.runs}', [table]))
 
 
 if __name__ == '__main__':
