@@ -6,6 +6,7 @@ A process of its own as any other: its main module runs from the start, and the 
 from __future__ import annotations
 
 import ctypes
+import io
 import json
 import os
 import select
@@ -118,6 +119,13 @@ def serve() -> dict[str, Any] | None:
     return None
 
 
+def stream(descriptor: int, errors: str, line_buffering: bool) -> io.TextIOWrapper:
+    """Returns an output of the process, as its own environment wants it; the server may have been started in another one."""
+    unbuffered = bool(os.environ.get('PYTHONUNBUFFERED'))
+    raw = os.fdopen(descriptor, 'wb', buffering=0 if unbuffered else -1, closefd=False)
+    return io.TextIOWrapper(raw, errors=errors, line_buffering=line_buffering, write_through=unbuffered)
+
+
 def become(request: dict[str, Any]) -> None:
     """Run the main module that was asked for, as the interpreter does."""
     import runpy
@@ -129,7 +137,7 @@ def become(request: dict[str, Any]) -> None:
         os.dup2(source, target)
     os.close(output)
     os.close(nothing)
-    sys.stdout.reconfigure(write_through=bool(os.environ.get('PYTHONUNBUFFERED')))
+    sys.stdout, sys.stderr = stream(1, 'strict', line_buffering=False), stream(2, 'backslashreplace', line_buffering=True)
     option, main, *arguments = request['arguments']
     if option == '-m':
         sys.argv = [main, *arguments]
