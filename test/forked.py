@@ -15,6 +15,7 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -151,13 +152,22 @@ def main() -> None:
     """Import what takes seconds, then fork."""
     import gc
 
-    import cv2  # noqa: F401
+    import cv2
+    import matplotlib.figure  # noqa: F401
     import torch
     import torch._dynamo  # torch imports it at the first step of an optimizer: a second  # noqa: F401
 
     import splatam_core.slam
     import splatam_core.worker  # noqa: F401
+    from splatam_core.datasets.room.caster import build_room
 
+    if find_spec('rclpy'):
+        import splatam_ros.node.node
+        import splatam_ros.player.player  # noqa: F401
+
+    cv2.setNumThreads(1)  # threads do not survive a fork
+    build_room(0)
+    cv2.setNumThreads(-1)
     gc.freeze()
     if (request := serve()) is not None:
         become(request)

@@ -227,7 +227,7 @@ def wait_until(condition: Callable[[], object], what: str, seconds: float = 60) 
 
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_runs_everything(cluster: Callable[[], subprocess.Popen[bytes]], tmp_path: Path) -> None:
-    words = ('run', 'synthetic', *TINY, '--preset', 'quick', '--no-evaluate')
+    words = ('run', 'synthetic', *TINY, '--preset', 'realtime', '--no-evaluate')
     jobs = [Job(f'seed{seed}', (*words, '--set', f'seed={seed}'), tmp_path / 'b' / f'seed{seed}') for seed in range(3)]
     workers = [cluster(), cluster()]
     outcomes = run_on_dask(jobs, cluster.address)

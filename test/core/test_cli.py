@@ -407,7 +407,7 @@ def test_ctrl_c_while_the_map_is_fitted_once_more_saves_it(
 # --- evaluate ---
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures('undrawn')
 def test_evaluate_repeats_the_run_s_own_scores(finished: Path, copy: Path) -> None:
     (copy / 'report.png').unlink()
     assert splatam('evaluate', copy) == 0

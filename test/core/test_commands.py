@@ -89,7 +89,9 @@ def replica_v2(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_test_split_is_scored_at_its_true_poses(replica_v2: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_test_split_is_scored_at_its_true_poses(
+    replica_v2: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], request: pytest.FixtureRequest
+) -> None:
     assert splatam('run', replica_v2, '--preset', 'quick', *FAST, '--no-evaluate', '--out', tmp_path / 'run') == 0
     assert splatam('evaluate', tmp_path / 'run', '--novel-views') == 0
     assert '1 views without holes; 1 with holes are scored apart' in capsys.readouterr().out
@@ -99,6 +101,7 @@ def test_test_split_is_scored_at_its_true_poses(replica_v2: Path, tmp_path: Path
     assert scores.novel.psnr_db == pytest.approx(scores.psnr_db, abs=2)
     assert scores.novel_holes.depth_l1_m > 2 * scores.novel.depth_l1_m
     assert 'novel view, with holes' in (tmp_path / 'run' / 'report.html').read_text()
+    request.getfixturevalue('undrawn')
     assert splatam('evaluate', tmp_path / 'run', '--novel-views', 'first') == 0
     assert metrics(tmp_path / 'run').novel_alignment == 'first'
 
@@ -211,6 +214,7 @@ def test_a_disk_that_is_full_while_rendering_is_said(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures('undrawn')
 def test_refine_makes_a_better_map_and_leaves_the_run_alone(
     run: RunRecord, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

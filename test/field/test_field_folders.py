@@ -109,6 +109,7 @@ def test_faulty_truth_is_one_error(tmp_path, lines):
 
 @pytest.mark.slow
 @pytest.mark.parametrize('name', ['no numbers', 'another clock'])
+@pytest.mark.usefixtures('undrawn')
 def test_faulty_truth_costs_neither_the_run_nor_the_image_scores(tmp_path, capsys, name):
     assert run(with_truth(tmp_path / 'in', FAULTY_TRUTHS[name]), tmp_path / 'out') == 0
     err = capsys.readouterr().err
@@ -121,7 +122,7 @@ def test_faulty_truth_costs_neither_the_run_nor_the_image_scores(tmp_path, capsy
         assert main(['evaluate', str(tmp_path / 'out'), '--every', '4']) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures('undrawn')
 def test_given_truth_with_a_fault_leaves_the_image_scores(tmp_path, capsys):
     assert run(tum(tmp_path / 'in'), tmp_path / 'out', '--no-evaluate') == 0
     (tmp_path / 'truth.txt').write_text('\n'.join(FAULTY_TRUTHS['no numbers']))
