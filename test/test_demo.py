@@ -122,7 +122,7 @@ def test_a_node_that_dies_ends_the_demo_with_its_last_words(out: Path) -> None:
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_every_process(out: Path, number: signal.Signals) -> None:
-    process = start_demo(out, 'synthetic:frames=30')
+    process = start_demo(out, 'synthetic:frames=12')
     wait_until(lambda: (out / 'trajectory.txt').is_file())
     process.send_signal(number)
     said, _ = process.communicate(timeout=TIMEOUT_S)

@@ -119,7 +119,7 @@ def test_fast_walk_needs_prediction_and_shows_new_ground():
     """The motion is beyond the paper's tracking steps from the last pose, but well within them from a predicted pose."""
     config = load_config('splatam').tracking
     reach = 2 * config.iterations * config.paper.rotation_rate  # radians: Adam moves each half-angle by its rate a step
-    walks = [SyntheticSequence(frames=240, width=32, motion=motion, seed=seed) for motion in MOTIONS for seed in (0, 1, 2)]
+    walks = [SyntheticSequence(frames=240, width=32, motion=motion, seed=seed) for seed in (0, 1, 2) for motion in MOTIONS]
     for sequence in walks:
         truth = sequence.ground_truth().T_world_cam
         steps = np.array([se3.log(se3.inverse(a) @ b) for a, b in pairwise(truth)])
