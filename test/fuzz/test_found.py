@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from kinds.bags import Statement, check_tables
 from kinds.base import Tally
+from kinds.messages import FACTORY, MAKERS
 from test_bags_of_people import scene, write
 
 from msg_adapters import images
@@ -100,6 +101,15 @@ def test_tables_of_a_bag_with_values_of_any_type(tmp_path: Path, column: str, wh
     table, _, name = column.partition('.')
     for value in VALUES:
         check_tables(bag, tally, [Statement(f'UPDATE OR IGNORE {table} SET {name} = ? WHERE {where}', (value,))])
+
+
+@pytest.mark.parametrize('sides', [(1, 65501), (65501, 1), (1, 16385), (16384, 4097)])
+@pytest.mark.parametrize('name', MAKERS)
+def test_an_image_that_could_not_be_read_back_is_not_sent(name: str, sides: tuple[int, int]) -> None:
+    """A wide JPEG was an AttributeError; the others were messages that no reader of ours takes."""
+    pixels = np.zeros((*sides, 3) if 'color' in name else sides, np.float32 if 'depth' in name else np.uint8)
+    with pytest.raises(MessageError, match='both sides must be from 1 to 16384 pixels'):
+        MAKERS[name](FACTORY, pixels, 1, 'camera')
 
 
 @pytest.mark.parametrize('chunk', [b'IHDR', b'IDAT', b'IEND', b'tEXt', b'PLTE', b'acTL', b'fcTL'])
