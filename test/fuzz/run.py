@@ -13,14 +13,17 @@ from __future__ import annotations
 
 import argparse
 import faulthandler
+import importlib
 import json
 import os
+import pkgutil
 import platform
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -36,6 +39,7 @@ from batches import Batch, Outcome, run_batch, run_here, values_of  # noqa: E402
 from kinds import KINDS, available  # noqa: E402
 from kinds.base import Case, Kind  # noqa: E402
 
+PACKAGES = ('msg_adapters', 'splatam_core', 'splatam_ros')
 FIRST_BATCH, BATCH_S = 30, 20.0
 """Values in the first batch of a case, and about how long the later ones take."""
 
@@ -162,6 +166,15 @@ def fuzz_to_the_goals(fuzzers: list[Fuzzer], minutes: float, save: Path | None) 
         save_counts(save, fuzzers)
 
 
+def import_everything() -> None:
+    """Load all modules of the project: Hypothesis draws from the constants in those that are loaded, and inputs must repeat."""
+    for name in PACKAGES:
+        with suppress(ImportError):
+            for module in pkgutil.walk_packages(importlib.import_module(name).__path__, f'{name}.'):
+                with suppress(ImportError):  # of what is optional
+                    importlib.import_module(module.name)
+
+
 def commit() -> str:
     """The commit of the checkout, with a mark if files differ from it."""
     described = subprocess.run(
@@ -250,6 +263,7 @@ def main() -> int:
     if given.table:
         print(goals_table(given.table))
         return 0
+    import_everything()
     kinds = [KINDS[name] for name in given.kind or KINDS if name not in given.leave_out]
     for missing in [kind for kind in kinds if kind not in available()]:
         print(f'{missing.name}: left out, because {missing.needs} is not installed')

@@ -16,6 +16,7 @@ from crossing import Crossing
 from hypothesis import strategies as st
 from kinds import KINDS, available
 from kinds.base import Case, Kind, Tally
+from processes import run_code
 
 from splatam_core.errors import DatasetError
 
@@ -60,6 +61,28 @@ def fuzz(check, hangs_after_s: float = 60.0, **bounds) -> Outcome:
     """Tries the numbers 0 to 20, in some order, some of them repeatedly."""
     case = Case('numbers', st.integers(0, 20), check)
     return run_batch(Batch(Kind('numbers', 1, lambda folder: [case], **bounds), case, SEED, 40), hangs_after_s)
+
+
+@pytest.mark.slow
+def test_an_input_repeats_whatever_was_tried_before_it(tmp_path: Path) -> None:
+    """Hypothesis draws from the constants in the modules that are loaded: an input used to repeat only after the same kinds."""
+    code = """
+        import sys
+        sys.path[:0] = ['test/fuzz', 'test']
+        import run
+        modules, sys.argv = sys.argv[1], ['run.py', *sys.argv[2:]]
+        for module in filter(None, modules.split(',')):
+            __import__(module)
+        run.main()
+    """
+    words = '--kind', 'messages', '--case', 'images to send', '--seed', 5, '--index', 61, '--inputs', 100
+    tried = [
+        run_code(code, modules, *words, log=tmp_path / str(number))
+        for number, modules in enumerate(['', 'splatam_core.evaluation.report.html,splatam_core.commands.bench'])
+    ]
+    assert [process.wait() for process in tried] == [0, 0], [process.text for process in tried]
+    first, second = (process.text for process in tried)
+    assert first == second and 'Tally(inputs=1' in first
 
 
 def test_what_is_used_and_refused_is_counted() -> None:
