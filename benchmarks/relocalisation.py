@@ -37,7 +37,7 @@ from splatam_core.slam import Slam
 from splatam_core.state import SlamState
 from splatam_core.types import RgbdFrame
 
-RECORDINGS = 'redkitchen_320:600', 'fr1_rpy_320:215', 'd435_desk:150'
+RECORDINGS = 'redkitchen_320:600', 'fr1_rpy_320:115', 'd435_desk:175'  # where there are most frames to join
 NEAR_M, NEAR_DEG = 0.5, 30.0
 RIGHT_M, RIGHT_DEG = 0.15, 8.0
 WITHIN, STRANGERS_FOR = 10, 30  # frames

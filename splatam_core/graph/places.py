@@ -11,7 +11,7 @@ refined on the pixels. Nothing is drawn at random. What is found is a guess: ali
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -154,7 +154,7 @@ class Places:
         return {number: keyframe.T_cam_world for number, keyframe in self._keyframes.items()}
 
     def find(self, view: View, limit: int, exclude: Collection[int] = (), attempt: int = 0) -> list[Place]:
-        """Returns where a view was perhaps taken, at most ``limit`` places, the one with most inliers first.
+        """Returns where a view was perhaps taken, at most ``limit`` poses that differ, the one with most inliers first.
 
         The view is compared with a bounded number of keyframes that are not near each other: with those that look most alike,
         and with others, which change from attempt to attempt.
@@ -166,8 +166,8 @@ class Places:
             attempt: how often about the same view was looked for before.
         """
         places = [self.compare(number, view) for number in self.candidates(view, exclude, attempt)]
-        found = [place for place in places if place is not None]
-        return sorted(found, key=lambda place: -place.num_inliers)[:limit]
+        found = sorted((place for place in places if place is not None), key=lambda place: -place.num_inliers)
+        return [found[index] for index in _apart([place.T_cam_world for place in found])][:limit]
 
     def candidates(self, view: View, exclude: Collection[int] = (), attempt: int = 0) -> list[int]:
         """Returns the numbers of the keyframes that are worth a comparison with a view. Arguments: see ``find``."""
@@ -199,16 +199,7 @@ class Places:
 
     def _spread(self, ranked: list[int]) -> list[int]:
         """Returns the keyframes of a ranking without those that are near one before them."""
-        poses = np.array([self._keyframes[number].T_cam_world for number in ranked]).reshape(-1, 4, 4)
-        centres = -np.einsum('nji,nj->ni', poses[:, :3, :3], poses[:, :3, 3])
-        is_free, chosen = np.ones(len(ranked), bool), []
-        for index, number in enumerate(ranked):
-            if is_free[index]:
-                chosen.append(number)
-                cosines = (np.einsum('nij,ij->n', poses[:, :3, :3], poses[index, :3, :3]) - 1) / 2
-                near = np.linalg.norm(centres - centres[index], axis=1) < _NEAR_M
-                is_free &= ~(near & (cosines > math.cos(_NEAR_RAD)))
-        return chosen
+        return [ranked[index] for index in _apart([self._keyframes[number].T_cam_world for number in ranked])]
 
     def _compare(self, number: int, seen: _Features) -> Place | None:
         """Matches a view with a keyframe; returns None if too few features agree on a pose."""
@@ -323,6 +314,20 @@ class _Matches:
         refined[:3, :3], refined[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
         agreeing = self._agreeing(refined)
         return (refined, agreeing) if np.isfinite(refined).all() and agreeing.sum() >= inliers.sum() else (T, inliers)
+
+
+def _apart(T_cam_world: Sequence[Matrix]) -> list[int]:
+    """Returns the indices of the poses [4, 4] that are not near one before them."""
+    poses = np.array(T_cam_world).reshape(-1, 4, 4)
+    centres = -np.einsum('nji,nj->ni', poses[:, :3, :3], poses[:, :3, 3])
+    is_free, chosen = np.ones(len(poses), bool), []
+    for index in range(len(poses)):
+        if is_free[index]:
+            chosen.append(index)
+            cosines = (np.einsum('nij,ij->n', poses[:, :3, :3], poses[index, :3, :3]) - 1) / 2
+            near = np.linalg.norm(centres - centres[index], axis=1) < _NEAR_M
+            is_free &= ~(near & (cosines > math.cos(_NEAR_RAD)))
+    return chosen
 
 
 def _rigid(points: Matrix, others: Matrix) -> Matrix:

@@ -1,8 +1,9 @@
 """Finds a camera that is lost, wherever in the map it is, and one whose pose was never known or is told by a person.
 
 The view is compared with all keyframes; the map is rendered at the poses that this suggests, and the view aligned to it. A pose
-that passes the verdict by itself, far more clearly than a frame in motion needs to, is tried on the next frame. Only if the
-camera can have moved from the one to the other, and the second one passes as well, the camera is tracked again
+that explains the view by itself, far more clearly than a frame in motion needs to, is tried on the next frame. Only if the
+camera can have moved from the one to the other, and the second one is explained as clearly, the camera is there. It is tracked
+again as soon as its pose is as sure as the verdict asks: with that frame, or with one of the next, which confirm it as well
 (docs/decisions/0014-relocalisation.md).
 """
 
@@ -22,9 +23,10 @@ from splatam_core.graph.places import Place, Places
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians
 from splatam_core.tracking import Tracker, TrackingResult
+from splatam_core.tracking.evidence import COLUMNS, ROWS
 from splatam_core.tracking.motion import Prediction
 from splatam_core.tracking.time_offset import TimeOffset
-from splatam_core.tracking.verdict import SAME_PLACE, Judge, JudgeState, Verdict, are_equal, better, verify
+from splatam_core.tracking.verdict import SAME_PLACE, Judge, JudgeState, Verdict, are_equal, better, largest_error, verify
 from splatam_core.types import Status
 
 _log = logging.getLogger(__name__)
@@ -32,10 +34,12 @@ _log = logging.getLogger(__name__)
 EAGER_FRAMES = 30
 """A camera lost for no longer than this many frames is looked for more often."""
 
-_EAGER_EVERY = 3  # frames
+_AT_FIRST = (10, 1), (EAGER_FRAMES, 3)  # until so many frames in doubt, every n-th one
 _NEAR_M, _NEAR_RAD = 2.0, 1.6  # of a pose that a person told: keyframes farther away are not considered
 _MAX_SHIFT_M, _MAX_TURN_RAD = 0.3, 0.3  # by which alignment may move the pose that features suggest
 _MIN_VISIBLE, _MIN_INLIERS, _MIN_EXPLAINED = 0.2, 0.8, 0.5
+_MIN_CELLS = ROWS * COLUMNS // 4  # of the view, in which brightness and depth fit
+_MAX_CONFIRMED = 4  # frames that confirm what was recognised; if they do not make the pose sure, the camera is looked for anew
 TOLD = -1
 """Stands for the number of a keyframe where a person told the pose."""
 
@@ -49,12 +53,14 @@ class Recognition:
         T_world_cam: [4, 4].
         covariance: [6, 6] of the pose, as a twist in the camera's axes.
         keyframe: number of the keyframe that was recognised, or ``TOLD``.
+        num_confirmed: number of frames that have confirmed it, while the pose was not sure enough to be tracked.
     """
 
     stamp_ns: int
     T_world_cam: Matrix
     covariance: Matrix
     keyframe: int
+    num_confirmed: int = 0
 
     @property
     def source(self) -> str:
@@ -173,7 +179,7 @@ class Relocaliser:
         state = self.state
         if not config.relocalises or state.num_in_doubt < EAGER_FRAMES or state.told is not None or state.recognised is not None:
             return False
-        return not self._is_due(state.num_in_doubt, config)
+        return not _is_due(state.num_in_doubt, config)
 
     def rest(self) -> Verdict:
         """Leaves a frame out."""
@@ -206,24 +212,18 @@ class Relocaliser:
             self._try_told(sight)
         elif verdict.status.is_trusted:
             self.state = RelocaliserState()
+        elif self.state.recognised is not None:
+            self._count()
         elif sight.config.relocalises:
             since = self.state.num_in_doubt - (verdict.status is Status.UNCERTAIN)  # one such frame is no reason to look elsewhere
-            if self.state.num_in_doubt >= EAGER_FRAMES or (since >= 0 and self._is_due(since, sight.config)):
-                self._recognise(sight, tracked)
+            if self.state.num_in_doubt >= EAGER_FRAMES or (since >= 0 and _is_due(since, sight.config)):
+                attempt = _attempts(max(since, 0), sight.config)
+                self.state = replace(self.state, recognised=recognise(sight, self.places, tracked, attempt))
             self._count()
         return None
 
     def _count(self) -> None:
         self.state = replace(self.state, num_in_doubt=self.state.num_in_doubt + 1)
-
-    def _is_due(self, count: int, config: TrackingConfig) -> bool:
-        every = config.align.relocalisation.every
-        return count % (min(_EAGER_EVERY, every) if count < EAGER_FRAMES else every) == 0
-
-    def _recognise(self, sight: Sight, tracked: TrackingResult) -> None:
-        """Looks for a place that shows what the frame shows, and better than the pose at which it was tracked."""
-        recognised = recognise(sight, self.places, tracked, attempt=self.state.num_in_doubt // _EAGER_EVERY)
-        self.state = replace(self.state, recognised=recognised)
 
     def _try_told(self, sight: Sight) -> None:
         """Tries the pose that a person told, and what the keyframes near it suggest."""
@@ -238,7 +238,7 @@ class Relocaliser:
         self.state = replace(self.state, told=None, recognised=None if aligned is None else aligned.recognition)
 
     def _confirmed(self, sight: Sight) -> Found | None:
-        """Returns the pose of the frame if it confirms what was recognised in the frame before."""
+        """Returns the pose of the frame if it confirms what was recognised before, and is sure. If not, the next one may be."""
         before, self.state = self.state.recognised, replace(self.state, recognised=None)
         if before is None:
             return None
@@ -249,13 +249,34 @@ class Relocaliser:
         judge = Judge()
         judge.state = JudgeState(covariance=before.covariance)
         result, verdict = judge.decide(result, prediction, sight.config)
-        if verdict.status is not Status.TRACKED or not is_convincing(result):
+        is_here = verdict.status is not Status.LOST and not judge.state.has_jumped and is_convincing(result)
+        num_confirmed = before.num_confirmed + is_here
+        if not is_here or (verdict.status is not Status.TRACKED and num_confirmed == _MAX_CONFIRMED):
             if before.keyframe == TOLD:
-                _log.warning('the pose that was told is refused: the next frame does not confirm it')
+                _log.warning('the pose that was told is refused: the next frames do not confirm it')
+            return None
+        if verdict.status is not Status.TRACKED:
+            pose = se3.inverse(result.T_cam_world)
+            recognised = Recognition(sight.stamp_ns, pose, judge.state.covariance, before.keyframe, num_confirmed)
+            self.state = replace(self.state, recognised=recognised)
             return None
         found = Found(result, verdict, judge.state, before.keyframe)
         _log.warning('relocalised by %s, at (%s) m', before.source, ', '.join(f'{x:.2f}' for x in found.T_world_cam[:3, 3]))
         return found
+
+
+def _attempts(count: int, config: TrackingConfig) -> int:
+    """Returns on how many of so many frames in a row that are in doubt the camera is looked for."""
+    every, begin, attempts = config.align.relocalisation.every, 0, 0
+    for end, step in (*_AT_FIRST, (max(count, EAGER_FRAMES), every)):
+        attempts += -(-max(0, min(count, end) - begin) // min(step, every))
+        begin = end
+    return attempts
+
+
+def _is_due(count: int, config: TrackingConfig) -> bool:
+    """Returns whether the camera is looked for on a frame, after so many in doubt."""
+    return _attempts(count + 1, config) > _attempts(count, config)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -278,7 +299,7 @@ def _aligned(
     result = sight.tracker.track(sight.view, sight.gaussians, T_cam_world)
     guess, judge = se3.inverse(T_cam_world), Judge()
     result, verdict = judge.decide(result, Prediction(guess, guess, math.inf, is_guess=True), sight.config)
-    if verdict.status is not Status.TRACKED or not is_convincing(result):
+    if verdict.status is Status.LOST or not is_convincing(result):
         return None
     shift_m, turn_rad = _apart(result.T_cam_world, T_cam_world)
     if shift_m > max_shift_m or turn_rad > max_turn_rad:
@@ -288,9 +309,17 @@ def _aligned(
 
 
 def is_convincing(result: TrackingResult) -> bool:
-    """Returns whether a pose explains a frame so well that it needs no frame before it."""
+    """Returns whether a pose explains a frame so well that it needs no frame before it.
+
+    It need not be as sure as that of a frame in motion: it says which place it is, and the next frames how it lies.
+    """
     evidence = result.evidence
-    is_determined = evidence is None or (not evidence.num_open and evidence.explained >= _MIN_EXPLAINED)
+    is_determined = evidence is None or (
+        not evidence.num_open
+        and evidence.explained >= _MIN_EXPLAINED
+        and evidence.num_explained >= _MIN_CELLS
+        and largest_error(evidence.covariance) <= SAME_PLACE
+    )
     return is_determined and result.visible_fraction >= _MIN_VISIBLE and result.inlier_fraction >= _MIN_INLIERS
 
 

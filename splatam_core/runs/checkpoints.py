@@ -208,7 +208,7 @@ def _relocaliser_content(state: RelocaliserState) -> Content:
     recognised = state.recognised
     values = {
         'num_in_doubt': state.num_in_doubt, 'is_anywhere': state.is_anywhere,
-        'recognised': None if recognised is None else [recognised.stamp_ns, recognised.keyframe],
+        'recognised': None if recognised is None else [recognised.stamp_ns, recognised.keyframe, recognised.num_confirmed],
     }  # fmt: skip
     arrays = {} if state.told is None else {'told': state.told}
     if recognised is not None:
@@ -228,7 +228,8 @@ def _relocaliser_state(content: Content) -> RelocaliserState:
         return RelocaliserState()
     stamped, recognised = values['recognised'], None
     if stamped is not None:
-        recognised = Recognition(stamped[0], arrays['recognised_T_world_cam'], arrays['recognised_covariance'], stamped[1])
+        T_world_cam, covariance = arrays['recognised_T_world_cam'], arrays['recognised_covariance']
+        recognised = Recognition(stamped[0], T_world_cam, covariance, *stamped[1:])  # 0.2.0 did not count what confirms it
     numbers = [values['num_in_doubt'], *(stamped or ())]
     if any(type(number) is not int or abs(number) >= 2**63 for number in numbers) or type(values['is_anywhere']) is not bool:
         raise ValueError(f'relocaliser = {values}: expected whole numbers')

@@ -271,7 +271,7 @@ class Judge:
 
     def _blend(self, step: Matrix, evidence: Evidence, prediction: Prediction, config: TrackingConfig) -> _Blend:
         """Returns how map, prediction and motion seen are combined: a Kalman filter where the map alone is not sure enough."""
-        if _off(evidence.covariance) <= _SURE * config.max_error_m or not math.isfinite(prediction.seconds):
+        if largest_error(evidence.covariance) <= _SURE * config.max_error_m or not math.isfinite(prediction.seconds):
             return _Blend.of_found(step, evidence.covariance)
         noise, moved, unseen, in_map = self._noise(prediction), np.zeros(6), np.eye(6), evidence.covariance
         if prediction.seen is not None:
@@ -353,7 +353,7 @@ class Judge:
 def is_weak(result: TrackingResult, config: TrackingConfig) -> bool:
     """Returns whether the map says so little about a pose that the motion since the last frame is worth a look."""
     evidence = result.evidence
-    return evidence is not None and not _off(evidence.covariance) <= _WEAK * _allowed_m(evidence, config)
+    return evidence is not None and not largest_error(evidence.covariance) <= _WEAK * _allowed_m(evidence, config)
 
 
 def _allowed_m(evidence: Evidence, config: TrackingConfig) -> float:
@@ -361,7 +361,7 @@ def _allowed_m(evidence: Evidence, config: TrackingConfig) -> float:
     return config.max_error_m * max(1.0, evidence.pixel_rad / _FINE_PIXEL_RAD)
 
 
-def _off(covariance: Matrix) -> float:
+def largest_error(covariance: Matrix) -> float:
     """Returns by how much a pose of a covariance [6, 6] may be off, m and rad."""
     return DEVIATIONS * max(_deviations(covariance))
 
@@ -375,7 +375,7 @@ def _updated(before: Matrix, measured: Matrix) -> tuple[Matrix, Matrix]:
 
 def _weakness(evidence: Evidence, covariance: Matrix, allowed_m: float, config: TrackingConfig) -> str:
     """Returns why too little is known about the pose of a frame; empty where it is enough."""
-    off = _off(covariance)
+    off = largest_error(covariance)
     if not off <= allowed_m:
         return f'its pose may be off by {100 * min(off, 99.0):.1f} cm (at most {100 * allowed_m:.1f} cm allowed)'
     explained = evidence.explained

@@ -13,7 +13,7 @@ from splatam_core.geometry import motions, se3
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.graph.keyframe_graph import KeyframeGraph, TrackedFrame
 from splatam_core.graph.pairs import PairResult
-from splatam_core.graph.places import Place
+from splatam_core.graph.places import NUM_FEATURES, Place
 from splatam_core.images.view import View
 from splatam_core.mapping.posed import PosedView
 from splatam_core.tracking.evidence import Evidence
@@ -123,6 +123,15 @@ def test_dropped_keyframes_leave_the_graph_small() -> None:
     assert len(camera.graph._active) <= 32
     assert len(camera.graph._links) < 20 * 32
     assert camera.errors_m()[-1] < 0.08 < 200 * np.linalg.norm(DRIFT[:3])
+
+
+def test_a_keyframe_takes_at_most_60_kb_beside_its_images() -> None:
+    """Features and edges, with as many loops as are looked for; objects of Python take as much again as the numbers in them."""
+    graph = Drifting(there_and_back(100)).run().graph
+    assert graph.num_loops > 50
+    of_graph = sum(array.nbytes for array in graph.arrays().values()) / len(graph.nodes)
+    of_features = NUM_FEATURES * (32 + 3 * 4 + 4 * 4)  # descriptor, point, keys
+    assert of_features + 2 * of_graph < 60_000
 
 
 def test_a_state_continues_bit_for_bit() -> None:

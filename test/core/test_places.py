@@ -9,7 +9,7 @@ import torch
 from splatam_core.config import DepthConfig
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.geometry import se3
-from splatam_core.graph.places import NUM_FEATURES, Places
+from splatam_core.graph.places import Places
 from splatam_core.images.view import View
 from splatam_core.mapping.posed import PosedView
 
@@ -98,8 +98,3 @@ def test_places_follow_the_keyframes(room: tuple[dict[int, View], np.ndarray]) -
     places.follow([posed[30], PosedView.at(views[60], moved, 60)])
     assert list(places.poses()) == [30, 60] and np.allclose(places.poses()[60], moved)
     assert np.allclose(places.find(views[60], 1)[0].T_cam_world, moved, atol=0.02)  # a few millimetres: pixels are rounded
-
-
-def test_a_keyframe_takes_at_most_60_kb() -> None:
-    bytes_per_feature = 32 + 3 * 4 + 4 * 4
-    assert NUM_FEATURES * bytes_per_feature < 60_000

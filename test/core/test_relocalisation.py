@@ -17,7 +17,9 @@ from splatam_core.datasets.registry import open_sequence
 from splatam_core.errors import CheckpointError, ConfigError
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.graph import relocalisation
 from splatam_core.graph.places import Places
+from splatam_core.graph.relocalisation import RelocaliserState
 from splatam_core.images.view import View
 from splatam_core.mapping.posed import PosedView
 from splatam_core.runs.archive import Content, pack, read_archive
@@ -95,6 +97,22 @@ def test_a_kidnapped_camera_is_found(walk: Walk) -> None:
     assert results[found].covariance is not None and results[found].covariance.drift_position_m > 0
 
 
+def test_frames_confirm_a_place_until_the_pose_is_sure(walk: Walk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which place it is can be clear while the pose is not: it says so after some frames, and looks anew."""
+    slam = in_the_map(walk, with_values(CONFIG, {'tracking.max_error_m': 1e-4}))
+    work = Work(slam, monkeypatch)
+    each, confirmed = [], []
+    for number in range(9):
+        each.append(work.of(slam, walk.away[number % 2])['compare'] > 0)
+        recognised = slam.state().relocaliser.recognised
+        confirmed.append(None if recognised is None else recognised.num_confirmed)
+    first = confirmed.index(0)
+    assert confirmed[first : first + 6] == [0, 1, 2, 3, 0, 1]
+    assert [first + index for index, is_compared in enumerate(each[first : first + 6]) if is_compared] == [first, first + 4]
+    slam.configure(CONFIG)
+    assert show(slam, walk.away[:1], slam.state().last_stamp_ns)[0].status is Status.TRACKED
+
+
 def test_a_camera_in_another_room_is_never_believed(walk: Walk) -> None:
     slam = in_the_map(walk)
     before = slam.snapshot()
@@ -140,6 +158,69 @@ def test_a_camera_lost_for_long_is_looked_for_now_and_then(walk: Walk) -> None:
     looked_for = [index for index, result in enumerate(results) if 'every n-th frame' not in result.reason]
     assert looked_for == [*range(30), 30, 40, 50]
     assert any(result.is_relocalised for result in show(slam, walk.away * 2, slam.state().last_stamp_ns))
+
+
+@pytest.mark.parametrize('every', [1, 2, 10])
+def test_it_is_looked_for_on_fewer_frames_the_longer_it_is_lost(every: int) -> None:
+    """On each of the first ten, then on every third, then on every n-th; an attempt has the number of those before it."""
+    tracking = with_values(CONFIG, {'tracking.align.relocalisation.every': every}).tracking
+    due = [*range(10), *range(10, 30, min(3, every)), *range(30, 60, every)]
+    assert [count for count in range(60) if relocalisation._is_due(count, tracking)] == due
+    assert [relocalisation._attempts(count, tracking) for count in due] == list(range(len(due)))
+
+
+class Work:
+    """Counts what takes time in a Slam: renders, steps of fitting, alignments, and comparisons of features."""
+
+    def __init__(self, slam: Slam, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.counts = dict.fromkeys(('render', 'fit', 'track', 'compare'), 0)
+        for owner, name in ((slam._rasterizer, 'render'), (slam._rasterizer, 'fit'), (slam._tracker, 'track')):
+            self._count(owner, name, monkeypatch)
+        self._count(slam.places, 'compare', monkeypatch)
+
+    def _count(self, owner: object, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        function = getattr(owner, name)
+
+        def counted(*args: object, **kwargs: object) -> object:
+            self.counts[name] += 1
+            return function(*args, **kwargs)
+
+        monkeypatch.setattr(owner, name, counted)
+
+    def of(self, slam: Slam, frame: RgbdFrame) -> dict[str, int]:
+        """Returns what a frame takes, without a gap in the stamps."""
+        self.counts = dict.fromkeys(self.counts, 0)
+        show(slam, [frame], slam.state().last_stamp_ns or 0)
+        return self.counts
+
+
+def test_a_frozen_map_takes_a_bounded_part_of_the_work(walk: Walk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Localisation only: nothing is fitted, kept or remembered, however long it goes on; a frame is aligned a few times."""
+    slam = in_the_map(walk, with_values(CONFIG, {'mapping.enabled': False, 'graph.enabled': True}))
+    show(slam, walk.away, walk.state.last_stamp_ns)
+    before, work = slam.state(), Work(slam, monkeypatch)
+    for number in range(20):
+        counts = work.of(slam, walk.away[-1 - number % 2])
+        assert counts['track'] <= 2 and counts['render'] <= 4 and counts['fit'] == counts['compare'] == 0
+    after = slam.state()
+    for one, other in ((before.map, after.map), (before.places, after.places), (before.graph, after.graph)):
+        assert one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
+    assert len(after.keyframes) == len(before.keyframes)
+    assert slam.finish() == 0
+
+
+def test_a_lost_camera_takes_a_bounded_part_of_the_work(walk: Walk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frame by frame, and in the long run: from the thirtieth frame on only every tenth is looked at."""
+    slam = in_the_map(walk)
+    work, frame = Work(slam, monkeypatch), walk.away[0]
+    mirrored = dataclasses.replace(frame, rgb=frame.rgb[:, ::-1].copy(), depth_m=frame.depth_m[:, ::-1].copy())
+    slam._relocaliser.state = RelocaliserState(num_in_doubt=27)
+    each = [work.of(slam, mirrored) for _ in range(25)]
+    assert slam.state().relocaliser.num_in_doubt == 52
+    assert max(counts['compare'] for counts in each) <= 12 and max(counts['track'] for counts in each) <= 2 + 3
+    for counts in each:  # aligned twice, and once more from features that are found in a render
+        assert counts['render'] <= 5 * counts['track'] and counts['fit'] == 0
+    assert [27 + index for index, counts in enumerate(each) if counts['track'] or counts['compare']] == [27, 28, 29, 30, 40, 50]
 
 
 def load(walk: Walk, T_world_cam: np.ndarray | None, tmp_path: Path) -> Slam:

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import signal
+from dataclasses import replace
+from itertools import chain, pairwise
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from camera import CAMERA_FRAME, Live, stamps_of
+from control import Control
+from graph import Graph
 
-from msg_adapters import markers, poses
+from msg_adapters import markers, poses, stamps
 from msg_adapters.factory import RclpyMessages
+from splatam_core.datasets.registry import open_sequence
 from splatam_core.geometry import motions, se3
 from splatam_core.graph.nodes import Nodes
+from splatam_core.maps.ply import read_ply
+from splatam_core.runs.map_keyframes import read_map_keyframes
 from splatam_core.types import FrameResult, StageTimings, Status
 from splatam_ros.frames.buffer import TransformBuffer
 from splatam_ros.frames.covariance import MotionEstimator
@@ -90,3 +99,59 @@ def test_a_graph_is_three_markers() -> None:
     assert [len(marker.points) for marker in message.markers] == [3, 4, 2]
     assert [point.x for point in message.markers[2].points] == [0.0, 2.0]
     assert {marker.header.frame_id for marker in message.markers} == {'map'}
+
+
+CLOSING_LOOPS = {
+    'preset': 'realtime', 'slam__graph__enabled': True, 'slam__graph__loop_after': 8, 'slam__graph__min_correction_m': 0.0,
+    'slam__keyframes__every': 2, 'slam__tracking__min_inlier_fraction': 0.5, 'queue_policy': 'all',
+}  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_running_node_corrects_map_to_odom_only(graph: Graph, tf_message: type) -> None:
+    """There and back, with loops: odometry never jumps, and the links of /tf make up the pose that is published."""
+    moving = graph.collect(tf_message, '/tf')
+    live = Live(graph, **CLOSING_LOOPS)
+    live.wait(lambda: graph.node.count_publishers('/tf'))
+    sequence = open_sequence('synthetic', width=96)
+    numbers = [*range(11), *range(9, -1, -1)]
+    shown = [live.show(replace(sequence[index], stamp_ns=10**9 + k * 33_333_333)) for k, index in enumerate(numbers)]
+    live.wait(lambda: stamps_of([message.transforms[0] for message in moving])[-1:] == stamps_of(shown[-1:]))
+    links: dict[str, dict[int, np.ndarray]] = {'odom': {}, CAMERA_FRAME: {}}
+    for transform in chain.from_iterable(message.transforms for message in moving):
+        stamp_ns = stamps.message_stamp_ns(transform)
+        links[transform.child_frame_id][stamp_ns] = poses.transform_matrix(transform.transform)
+    corrections, odometry = links['odom'], links[CAMERA_FRAME]
+    steps_m = [np.linalg.norm((se3.inverse(a) @ b)[:3, 3]) for a, b in pairwise(odometry.values())]
+    assert max(steps_m) < 0.05  # the camera moves by less than 2 cm a frame
+    assert len({T.tobytes() for T in corrections.values()}) > 1
+    for pose in shown:
+        stamp_ns = stamps.message_stamp_ns(pose)
+        if stamp_ns in odometry:  # the subscription may be discovered after the first frames
+            np.testing.assert_allclose(corrections[stamp_ns] @ odometry[stamp_ns], poses.pose_matrix(pose.pose), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_yesterdays_map_goes_on(graph: Graph) -> None:
+    """Two days: the second one finds itself in the map of the first, maps on, corrects on demand, and saves both."""
+    sequence, folders = open_sequence('synthetic', width=160), [graph.folder / day for day in ('first', 'second')]
+    settings = {**CLOSING_LOOPS, 'slam__mapping__iterations': 3}
+
+    def walk(live: Live, numbers: range, since_ns: int) -> list[Any]:
+        return [live.show(replace(sequence[index], stamp_ns=since_ns + k * 33_333_333)) for k, index in enumerate(numbers)]
+
+    def end(live: Live) -> None:
+        live.node.send(signal.SIGINT)
+        assert live.node.wait() == 0
+
+    first = Live(graph, **settings, save_path=folders[0])
+    assert walk(first, range(0, 48, 3), 10**9)[-1] is not None
+    end(first)
+    second = Live(graph, **settings, load_path=folders[0], save_path=folders[1])
+    assert second.node.says('keyframes', 'is looked for by them')
+    shown = walk(second, range(1, 40, 3), 10**10)
+    assert shown[0] is None and shown[-1] is not None and second.node.says('relocalised by keyframe')
+    Control(graph).succeed('optimize')
+    end(second)
+    sizes = [(len(read_ply(folder / 'map.ply')), len(read_map_keyframes(folder / 'map.keyframes').keyframes)) for folder in folders]
+    assert all(after > before for before, after in zip(*sizes, strict=True))
