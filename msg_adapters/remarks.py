@@ -57,3 +57,12 @@ def on_gap(gap_ns: int) -> str:
         f'depth is {gap_ns / 1e9:+.3f} s from its colour: a moving camera will smear the map; '
         'synchronize the two in the driver, or lower sync.max_interval (offline: --max-interval)'
     )
+
+
+def on_wrong_stamp(off_ns: int) -> str:
+    """Returns why a frame is left out that is out of line with those around it.
+
+    Args:
+        off_ns: its stamp minus that of the frame before it.
+    """
+    return f'its stamp is {off_ns / 1e9:+.3f} s from the frames around it; do the stamps increase, and come from one clock?'

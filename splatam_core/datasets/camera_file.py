@@ -10,7 +10,7 @@
     cy: 239.5
     distortion_model: plumb_bob         # optional: rational_polynomial, equidistant or none (default)
     distortion: [0.1, -0.2, 0, 0, 0]    # optional: coefficients in OpenCV's order
-    depth_scale: 1000                   # optional: stored depth counts per metre
+    depth_scale: 1000                   # optional: stored depth counts per metre; below 1: metres per count
     pose_axes: opencv                   # optional, plain folders only: or opengl
 
 The file that ROS's camera_calibration writes (``image_width``, ``camera_matrix``, ``distortion_coefficients``) is read, too;
@@ -122,7 +122,7 @@ def read_camera_file(path: Path) -> CameraFile:
     if unknown := values.keys() - REQUIRED - OPTIONAL:
         raise CameraError(f'{path}: unknown {", ".join(sorted(map(str, unknown)))}')
     try:
-        return _parse(values)
+        return _parse(path, values)
     except (TypeError, ValueError, OverflowError, CameraError) as error:
         raise CameraError(f'{path}: {error}') from None
 
@@ -163,14 +163,24 @@ def checked_depth_scale(value: Any) -> float:
     return scale
 
 
-def _parse(values: dict[str, Any]) -> CameraFile:
+def _counts_per_metre(path: Path, value: Any) -> float:
+    """Returns counts per metre; a number below 1 is metres per count, as the node's parameter of this name."""
+    stated = float(value)
+    if not 0 < stated < 1:
+        return checked_depth_scale(value)
+    scale = checked_depth_scale(float(f'{1 / stated:.7g}'))
+    _log.warning('%s: depth_scale %s is read as metres per count: %s counts per metre', path, value, f'{scale:g}')
+    return scale
+
+
+def _parse(path: Path, values: dict[str, Any]) -> CameraFile:
     width, height = whole(values, 'width'), whole(values, 'height')
     fx, fy, cx, cy = (float(values[key]) for key in ('fx', 'fy', 'cx', 'cy'))
     pinhole = PinholeCamera(width, height, fx, fy, cx, cy)
     distortion = tuple(float(value) for value in values.get('distortion') or ())
-    scale = values.get('depth_scale')
+    scale = None if values.get('depth_scale') is None else _counts_per_metre(path, values['depth_scale'])
     axes = values.get('pose_axes')
     if axes not in (None, *POSE_AXES):
         raise CameraError(f"pose_axes '{axes}' is not one of {', '.join(POSE_AXES)}")
     model = values.get('distortion_model') or 'none'
-    return CameraFile(CameraCalibration(pinhole, model, distortion), None if scale is None else checked_depth_scale(scale), axes)
+    return CameraFile(CameraCalibration(pinhole, model, distortion), scale, axes)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 
 import numpy as np
+from numpy.typing import NDArray
 
 NS_PER_S = 1_000_000_000
 LIMIT_NS = 2**62
@@ -102,3 +103,19 @@ def stamp_text(stamp_ns: int) -> str:
     """Returns seconds with nine decimals, which is exact."""
     seconds, rest_ns = divmod(abs(stamp_ns), NS_PER_S)
     return f'{"-" if stamp_ns < 0 else ""}{seconds}.{rest_ns:09d}'
+
+
+def stray_stamps(stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Returns which stamps [N] are wrong: time does not increase with them, and does without them.
+
+    Only single ones between others that agree. Where two that follow each other agree against those before, time has jumped.
+    """
+    known, wrong = stamps_ns.tolist(), np.zeros(len(stamps_ns), bool)
+    if len(known) < 3:
+        return wrong
+    for at in (np.flatnonzero(np.diff(stamps_ns) <= 0) + 1).tolist():
+        if known[at - 2] < known[at] if at > 1 else known[1] < known[2]:
+            wrong[at - 1] = True
+        elif at > 1 and (at + 1 == len(known) or known[at - 1] < known[at + 1]):
+            wrong[at] = True
+    return wrong

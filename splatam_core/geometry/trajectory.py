@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from splatam_core.errors import DatasetError
 from splatam_core.geometry import se3
-from splatam_core.geometry.stamps import SECONDS, StampUnit, guess_unit, stamp_number, stamp_text
+from splatam_core.geometry.stamps import SECONDS, StampUnit, guess_unit, stamp_number, stamp_text, stray_stamps
 from splatam_core.geometry.stamps import stamp_from_text as stamp_from_text
+from splatam_core.geometry.table_heading import named_columns
 from splatam_core.text_files import read_text
 
 MAX_GROUND_TRUTH_GAP_NS = 500_000_000
@@ -129,14 +130,15 @@ def read_trajectory(path: Path) -> Trajectory:
 def read_ground_truth(path: Path) -> Trajectory:
     """Reads a TUM trajectory of true poses.
 
-    Poses that are unknown (NaN, infinite, or without rotation), lines that are no pose, and further poses of the same stamp
-    are left out, and counted in a warning. Stamps may be milliseconds, microseconds or nanoseconds, which a warning says.
+    Poses that are unknown (NaN, infinite, or without rotation), lines that are no pose, further poses of the same stamp, and
+    single poses with a wrong stamp are left out, and counted in a warning. Stamps may be milliseconds, microseconds or
+    nanoseconds, and a heading may name the columns in another order; a warning says so.
 
     Raises:
         DatasetError: the file cannot be read, more than a tenth of the lines are no poses, no pose is known, or the stamps do
             not increase.
     """
-    lines = _lines(path)
+    lines = _lines(path, is_table=True)
     poses = [line.pose for line in lines if line.pose is not None]
     faulty = [line for line in lines if line.pose is None]
     if too_many(len(faulty), len(lines)):
@@ -144,9 +146,12 @@ def read_ground_truth(path: Path) -> Trajectory:
     known = [pose for pose in poses if pose.is_known]
     if poses and not known:
         raise DatasetError(f'{path}: none of its {len(poses)} poses is known: each holds NaN, infinity or no rotation')
-    rows = _rows(path, known)
+    stamped = _rows(path, known)
+    is_stray = stray_stamps(np.array([stamp_ns for stamp_ns, _ in stamped], np.int64))
+    rows = [row for row, stray in zip(stamped, is_stray, strict=True) if not stray]
     counts = {
-        'no poses': len(faulty), 'unknown': len(poses) - len(known), 'of a stamp that is there already': len(known) - len(rows)
+        'no poses': len(faulty), 'unknown': len(poses) - len(known), 'of a stamp that is there already': len(known) - len(stamped),
+        'with a stamp that contradicts those around it': len(stamped) - len(rows),
     }  # fmt: skip
     left_out = [f'{count} {why}' for why, count in counts.items() if count]
     if left_out:
@@ -221,11 +226,24 @@ class _Line:
         return f"{path}:{self.number}: expected 'stamp tx ty tz qx qy qz qw' with a non-zero quaternion, got '{shown}'"
 
 
-def _lines(path: Path) -> list[_Line]:
-    """Returns the lines of a trajectory that are no comments."""
-    lines = read_text(path, DatasetError).splitlines()
+def _lines(path: Path, *, is_table: bool = False) -> list[_Line]:
+    """Returns the lines of a trajectory that are no comments.
+
+    Args:
+        path: the file.
+        is_table: True if a heading may name the columns, in any order; it is no line of the trajectory then.
+    """
+    text = read_text(path, DatasetError)
+    lines = (text.replace(';', ',') if is_table else text).splitlines()
+    columns = named_columns(lines) if is_table else None
+    heading = 0 if columns is None else columns.line
     numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith('#')]
-    return [_Line(number, line, _stated_pose(line)) for number, line in numbered]
+    first = next((line for number, line in numbered if number != heading), '')
+    if columns is None or (columns.are_in_order and _stated_pose(first) is not None):
+        return [_Line(number, line, _stated_pose(line)) for number, line in numbered]
+    _log.warning('%s: columns are read as line %d names them', path, heading)
+    fields = [(number, line, columns.fields(line)) for number, line in numbered if number != heading]
+    return [_Line(number, line, _stated_pose(' '.join(found))) for number, line, found in fields]
 
 
 def _stated_pose(line: str) -> _StatedPose | None:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.se3 import Matrix
+from splatam_core.images.features import orb_features
 from splatam_core.images.view import View
 from splatam_core.mapping.posed import PosedView
 from splatam_core.types import Arrays
@@ -242,13 +243,11 @@ class _Features:
     def of(cls, view: View) -> _Features:
         """Finds the features of a view."""
         view = view.narrowed(1.0, MAX_WIDTH)
-        orb = cv2.ORB.create(NUM_FEATURES, fastThreshold=_FAST_THRESHOLD)
-        grey = cv2.cvtColor(view.rgb8.numpy(force=True), cv2.COLOR_RGB2GRAY)
-        keypoints, descriptors = orb.detectAndCompute(grey, None)
+        keypoints, descriptors = orb_features(view.rgb8.numpy(force=True), NUM_FEATURES, _FAST_THRESHOLD)
         if descriptors is None:
             return cls(view.camera, np.empty((0, 2)), np.empty((0, 32), np.uint8), np.empty((0, 3), np.float32))
         pixels = np.array([keypoint.pt for keypoint in keypoints[:NUM_FEATURES]], np.float64)  # OpenCV returns more at a tie
-        return cls(view.camera, pixels, descriptors[:NUM_FEATURES].astype(np.uint8, copy=False), _points(view, pixels))
+        return cls(view.camera, pixels, descriptors[:NUM_FEATURES], _points(view, pixels))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -50,8 +50,12 @@ PROGRAMS = ('splatam run', 'splatam refine', 'splatam merge', 'splatam_node')
 """What writes run folders, as ``run.json`` names it."""
 
 
-def check_is_free(path: Path) -> None:
+def check_is_free(path: Path, *, may_overwrite: bool = False) -> None:
     """Checks that nothing is at a path, or only an empty folder.
+
+    Args:
+        path: where a folder is to be made.
+        may_overwrite: True where a run can be replaced on request: then the error says how.
 
     Raises:
         RunFolderError: something is there, or nobody can tell.
@@ -62,7 +66,7 @@ def check_is_free(path: Path) -> None:
     except (OSError, ValueError) as error:
         raise RunFolderError(f'{path}: cannot be used: {why_not(error)}; choose another folder') from None
     if not is_free:
-        hint = ', or replace the run in it with --overwrite (the node: overwrite:=true)' if holds_run else ''
+        hint = ', or replace the run in it with --overwrite (the node: overwrite:=true)' if holds_run and may_overwrite else ''
         raise RunFolderError(f'{path} exists: choose another folder{hint}')
 
 

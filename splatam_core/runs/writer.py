@@ -125,7 +125,7 @@ class RunFolder:
                 remove_run(path)
                 check_is_free(path)
             else:
-                check_is_free(path)
+                check_is_free(path, may_overwrite=True)
                 path.mkdir(parents=True, exist_ok=True)
                 lock = FolderLock(path)
             return cls._begin(path, config, run_information(description) | {'backend': backend}, lock)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from splatam_core.geometry.se3 import Matrix
+from splatam_core.images.features import orb_features
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Render
 
@@ -48,10 +49,9 @@ def pose_by_features(render: Render, view: View) -> Matrix | None:
 
 def _matches(render: Render, view: View) -> tuple[Matrix, Matrix]:
     """Returns [K, 3] points in the render's camera and [K, 2] the pixels of the frame that match them."""
-    orb = cv2.ORB.create(_NUM_FEATURES, fastThreshold=_FAST_THRESHOLD)
     drawn = render.rgb.permute(1, 2, 0).mul(255).round().clamp(0, 255).byte().numpy(force=True)
     (render_keypoints, render_descriptors), (frame_keypoints, frame_descriptors) = (
-        orb.detectAndCompute(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), None) for rgb in (drawn, view.rgb8.numpy(force=True))
+        orb_features(rgb, _NUM_FEATURES, _FAST_THRESHOLD) for rgb in (drawn, view.rgb8.numpy(force=True))
     )
     if render_descriptors is None or frame_descriptors is None:
         return np.empty((0, 3)), np.empty((0, 2))

@@ -127,9 +127,8 @@ class FrameAssembler:
 
     def _drop_wrong_stamp(self, found: RgbdSet, last_ns: int) -> None:
         self._warnings.warn(
-            'wrong stamp', f'frame {stamp_text(found.stamp_ns)} skipped: its stamp is {(found.stamp_ns - last_ns) / 1e9:+.3f} s '
-            'from the frames around it; do the stamps increase, and come from one clock?',
-        )  # fmt: skip
+            'wrong stamp', f'frame {stamp_text(found.stamp_ns)} skipped: {remarks.on_wrong_stamp(found.stamp_ns - last_ns)}'
+        )
         self._on_rejected(found.stamp_ns)
 
     def _is_admitted(self, found: RgbdSet) -> bool:

@@ -216,6 +216,31 @@ def test_one_camera_info_of_another_camera_costs_itself(tmp_path, caplog, stray,
 # --- stamps and pairs ---
 
 
+@pytest.mark.parametrize('number', [0, 3, 5])
+@pytest.mark.parametrize('off_ns', [86400 * SECOND, -3 * SECOND // 2])
+def test_a_frame_with_a_wrong_stamp_costs_itself(tmp_path, caplog, number, off_ns):
+    """As it does for the node. The last one a day ahead, or the first one too early, contradicts no other."""
+
+    def stamped(make):
+        return lambda ns: make(ns + (off_ns if ns == 2 * SECOND + number * PERIOD else 0))
+
+    messages = scene(count=6, make_info=lambda ns: info(ns + SECOND), make_color=lambda ns: stamped(color)(ns + SECOND),
+                     make_depth=lambda ns: stamped(depth)(ns + SECOND))  # fmt: skip
+    read = open_sequence(str(write(tmp_path / 'bag', messages)))
+    is_in_line = (number, off_ns > 0) in ((5, True), (0, False))
+    frames = [read[index] for index in range(len(read))]
+    assert len(frames) == 6 - (not is_in_line) and all((np.diff([frame.stamp_ns for frame in frames]) > 0).tolist())
+    if not is_in_line:
+        assert re.search(r'1 of 6 frames are skipped: .* its stamp is .* s from the frames around it', caplog.text)
+
+
+def test_time_that_jumps_back_is_refused_where_two_frames_agree(tmp_path):
+    messages = scene(count=6, make_color=lambda ns: color(ns + (ns < SECOND + 3 * PERIOD) * 9 * SECOND),
+                     make_depth=lambda ns: depth(ns + (ns < SECOND + 3 * PERIOD) * 9 * SECOND))  # fmt: skip
+    with pytest.raises(DatasetError, match='time does not increase from frame 2 .* to frame 3'):
+        open_sequence(str(write(tmp_path / 'bag', messages)))
+
+
 def test_depth_that_is_late_is_paired_by_the_rate(tmp_path, caplog):
     read = open_sequence(str(write(tmp_path / 'bag', scene(period=66 * MS, depth_late=30 * MS))))
     assert len(read) == 4

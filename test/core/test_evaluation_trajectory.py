@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -24,6 +26,7 @@ from splatam_core.geometry.trajectory import (
     Trajectory,
     interpolate_centres,
     interpolate_poses,
+    read_ground_truth,
 )
 from splatam_core.types import PoseCovariance
 
@@ -297,3 +300,32 @@ def test_errors_in_deviations_are_one_where_covariances_are_true() -> None:
     unsure = normalized_errors(estimate, truth, covariances, noise=TruthNoise(1.0, 1.0))
     assert unsure.max() < 0.1
     assert len(normalized_errors(estimate, truth, {})) == 0
+
+
+@pytest.mark.parametrize(
+    ('heading', 'line'),
+    [
+        ('#timestamp [ns],p_x [m],p_y [m],p_z [m],q_w [],q_x [],q_y [],q_z []', '{},1,2,3,0.6,0.8,0,0'),
+        ('#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v_RS_R_x [m s^-1], '
+         'v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1]', '{}, 1, 2, 3, 0.6, 0.8, 0, 0, 9, 9, 9, 9'),
+        ('# timestamp(s) tx ty tz qx qy qz qw Pr11 Pr12', '{} 1 2 3 0.8 0 0 0.6 5 5'),
+        ('frame;time;x;y;z;qw;qx;qy;qz', '7;{};1;2;3;0.6;0.8;0;0'),
+        ('header.stamp pose.orientation.w pose.orientation.x pose.orientation.y pose.orientation.z pose.position.x '
+         'pose.position.y pose.position.z', '{} 0.6 0.8 0 0 1 2 3'),
+        ('# timestamp tx ty tz qx qy qz qw', '{} 1 2 3 0.8 0 0 0.6'),
+        ('# a trajectory: tx ty tz qx qy qz qw, by axes x and y', '{} 1 2 3 0.8 0 0 0.6'),
+    ],
+)  # fmt: skip
+def test_columns_are_read_as_their_heading_names_them(
+    tmp_path: Path, heading: str, line: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A quaternion that begins with w used to be read as one that ends with it, in silence."""
+    path = tmp_path / 'truth.csv'
+    path.write_text('\n'.join([heading, *(line.format(stamp) for stamp in (1.0, 1.1, 1.2))]))
+    truth = read_ground_truth(path)
+    assert truth.stamps_ns.tolist() == [1_000_000_000, 1_100_000_000, 1_200_000_000]
+    assert np.allclose(truth.T_world_cam[:, :3, 3], [1, 2, 3])
+    assert np.allclose(truth.T_world_cam[0, :3, :3], [[1, 0, 0], [0, -0.28, -0.96], [0, 0.96, -0.28]])
+    is_usual = line == '{} 1 2 3 0.8 0 0 0.6'
+    said = [record.message.partition(': ')[2] for record in caplog.records]
+    assert said == ([] if is_usual else ['columns are read as line 1 names them'])

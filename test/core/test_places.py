@@ -9,9 +9,12 @@ import torch
 from splatam_core.config import DepthConfig
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.geometry import se3
+from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.graph.places import Places
 from splatam_core.images.view import View
 from splatam_core.mapping.posed import PosedView
+from splatam_core.rasterizer import Render
+from splatam_core.tracking.features import pose_by_features
 
 KEYFRAMES = range(0, 300, 30)
 
@@ -98,3 +101,18 @@ def test_places_follow_the_keyframes(room: tuple[dict[int, View], np.ndarray]) -
     places.follow([posed[30], PosedView.at(views[60], moved, 60)])
     assert list(places.poses()) == [30, 60] and np.allclose(places.poses()[60], moved)
     assert np.allclose(places.find(views[60], 1)[0].T_cam_world, moved, atol=0.02)  # a few millimetres: pixels are rounded
+
+
+@pytest.mark.parametrize('size', [(1, 1), (1, 160), (160, 1), (4000, 2), (2, 2), (8, 8), (30, 400)])
+def test_images_too_small_for_a_feature_have_none(places: Places, size: tuple[int, int]) -> None:
+    """OpenCV fails over those of a few pixels; a keyframe of a damaged file may have any size."""
+    width, height = size
+    rgb = torch.from_numpy(np.random.default_rng(0).integers(0, 255, (height, width, 3), np.uint8))
+    view = View(PinholeCamera(width, height, 50.0, 50.0, width / 2, height / 2), rgb, torch.ones(height, width))
+    assert places.find(view, 3) == []
+    few = Places()
+    few.add(0, view, np.eye(4))
+    assert len(few) == 1 and len(few.arrays()['points']) == 0
+    flat = torch.ones(height, width)
+    render = Render(rgb.permute(2, 0, 1) / 255, flat, flat)
+    assert pose_by_features(render, view) is None

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from splatam_core.atomic_io import new_folder
+from splatam_core.cli import main
 from splatam_core.config import load_config
 from splatam_core.errors import RunFolderError
 from splatam_core.geometry import se3
@@ -209,6 +210,18 @@ def test_existing_results_stay(tmp_path: Path) -> None:
     with pytest.raises(RunFolderError, match='exists: choose another folder, or replace the run in it with --overwrite'):
         RunFolder.create(tmp_path, CONFIG, OFFLINE)
     assert tree(tmp_path) == before
+
+
+def test_only_what_can_overwrite_a_run_says_how(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = written(RunFolder.create(tmp_path / 'run', CONFIG, NODE), 0)
+    other = written(RunFolder.create(tmp_path / 'other', CONFIG, NODE), 0)
+    with pytest.raises(RunFolderError, match='exists: choose another folder') as caught:
+        other.moved(tmp_path / 'run')
+    run.close()
+    other.close()
+    assert main(['merge', str(tmp_path / 'run'), str(tmp_path / 'run'), '--out', str(tmp_path / 'other')]) == 2
+    for text in (str(caught.value), capsys.readouterr().err):
+        assert 'exists: choose another folder' in text and '--overwrite' not in text
 
 
 def test_overwrite_removes_a_run_and_nothing_else(tmp_path: Path) -> None:

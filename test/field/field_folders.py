@@ -78,6 +78,24 @@ def with_truth(folder: Path, lines: Sequence[str], texts: Sequence[str] | None =
     return folder
 
 
+def wrong_stamp(stamp: str) -> Callable[[Path], Path]:
+    """A truth whose fourth pose has another stamp."""
+
+    def write(folder: Path) -> Path:
+        lines = pose_lines(stamps())
+        lines[3] = f'{stamp} {lines[3].split(maxsplit=1)[1]}'
+        return with_truth(folder, lines)
+
+    return write
+
+
+def metres_per_count(folder: Path) -> Path:
+    """The unit of depth as the node's parameter states it."""
+    tum(folder)
+    camera_yaml(folder, depth_scale=0.0002)
+    return folder
+
+
 def unknown(pose: str) -> Callable[[Path], Path]:
     """A truth whose fourth pose is unknown. pose: what stands for it after the stamp."""
 
@@ -160,6 +178,7 @@ class Brought:
 
 MILLIMETRES = 'depth is taken as millimetres'
 ONE_UNKNOWN = r'groundtruth\.txt: of 8 lines with poses these are left out: 1 unknown'
+ONE_STRAY = r'groundtruth\.txt: of 8 lines with poses these are left out: 1 with a stamp that contradicts those around it'
 
 FOLDERS = {
     'associations': Brought(associations, says=MILLIMETRES),
@@ -175,6 +194,10 @@ FOLDERS = {
     'truth, a stamp twice': Brought(
         lambda f: with_truth(f, [*pose_lines(stamps()), pose_lines(stamps())[-1]]), says='1 of a stamp that is there', truth=8
     ),
+    'truth, a stamp a day ahead': Brought(wrong_stamp(stamps(first_s=FIRST_S + 86400)[3]), says=ONE_STRAY, truth=7),
+    'truth, a stamp of zero': Brought(wrong_stamp('0'), says=ONE_STRAY, truth=7),
+    'truth, semicolons': Brought(lambda f: with_truth(f, pose_lines(stamps(), ';')), truth=8),
+    'depth_scale in metres': Brought(metres_per_count, says='0.0002 is read as metres per count: 5000 counts'),
     'truth table': Brought(lambda f: with_truth(f, pose_lines(stamps(), ',')), truth=8),
     'truth nanoseconds': Brought(
         lambda f: with_truth(f, pose_lines(stamps(10**9))), says=r'groundtruth\.txt: stamps look like nanoseconds', truth=8

@@ -21,6 +21,7 @@ from splatam_core.datasets.bag.topics import ChosenTopics
 from splatam_core.datasets.base import check_increasing, nearest_depth
 from splatam_core.errors import CameraError, DatasetError
 from splatam_core.geometry.camera import CameraCalibration
+from splatam_core.geometry.stamps import stray_stamps
 from splatam_core.geometry.trajectory import Trajectory, stamp_text
 
 QUEUE_SIZE = 300  # ten seconds of one stream before the other begins
@@ -127,8 +128,22 @@ class BagIndex:
             _log.warning('%s: %d of %d colour images have a stamp that another one has, too', self.path, repeated, counts[rgb])
         if (alone := counts[rgb] - repeated - len(pairs)) > 0:
             _log.warning('%s: %d of %d colour images have no depth', self.path, alone, counts[rgb])
+        pairs = self._without_strays(pairs)
         check_increasing(np.array([pair.stamp_ns for pair in pairs], np.int64), str(self.path))
         return pairs
+
+    def _without_strays(self, pairs: list[RgbdSet]) -> list[RgbdSet]:
+        """Leaves out single frames with a wrong stamp, as the node does."""
+        is_stray = stray_stamps(np.array([pair.stamp_ns for pair in pairs], np.int64))
+        if not is_stray.any():
+            return pairs
+        at = int(np.flatnonzero(is_stray)[0])
+        off_ns = pairs[at].stamp_ns - pairs[at - 1 if at else 1].stamp_ns
+        _log.warning(
+            '%s: %d of %d frames are skipped: of the first, %s, %s',
+            self.path, is_stray.sum(), len(pairs), stamp_text(pairs[at].stamp_ns), remarks.on_wrong_stamp(off_ns),
+        )  # fmt: skip
+        return [pair for pair, stray in zip(pairs, is_stray, strict=True) if not stray]
 
     def _nearest(self) -> str:
         """Returns how far depth is from colour, for the error message; empty where one of them is missing."""
