@@ -30,7 +30,7 @@ from splatam_core.graph.links import (
     Task,
     Work,
     brought_together,
-    contradiction,
+    contradictions,
     deviations,
     inverse,
     parts,
@@ -52,7 +52,7 @@ WINDOW = 1, 2
 """A keyframe is aligned directly to those so many before it: farther apart the odometry is better."""
 
 _MOST_WRONG = 4.0  # deviations of a loop, by which the optimised graph contradicts it at most: 8 cm
-_LEAST_DRIFT = 0.5  # of the squared disagreement of loops, in position, that a correction takes away
+_LEAST_DRIFT = 0.85  # of the squared disagreement of loops, in their deviations, that a correction takes away
 _MAX_BACK = 0.02, 0.015  # m, rad: there and back
 _LEAST_OVERLAP, _LEAST_AGREEMENT = 0.3, 0.9
 _MAX_SURPRISE = 0.05  # m and rad: a pair in the window that is farther from the odometry is wrong
@@ -367,7 +367,7 @@ class KeyframeGraph:
         if solution is None:
             return None
         nodes, least = self._active[:num_nodes], self._config.min_correction_m
-        disagrees = any(self._off(loop) > least for loop in self.loops())
+        disagrees = self._most_off() > least
         moves = size(motions.between(self.nodes.T_world_cam[nodes], solution)) > least
         if not (disagrees and moves and self._is_drift(nodes, solution)):
             return None
@@ -417,10 +417,8 @@ class KeyframeGraph:
         self._solving, solution = None, solving.optimizer.solution()
         poses = solution.T_world_cam if solution.is_better else solution.T_before
         at = dict(zip(self._active, poses))
-        wrong = {
-            id(link) for link in self._sure(solving.num_links)
-            if link.kind is Kind.LOOP and deviations(link, at) > _MOST_WRONG
-        }  # fmt: skip
+        loops = [link for link in self._sure(solving.num_links) if link.kind is Kind.LOOP]
+        wrong = {id(loop) for loop, off in zip(loops, deviations(loops, at)) if off.max() > _MOST_WRONG}
         if not wrong:
             return poses
         _log.info('%d loops contradict the graph at frame %d', len(wrong), self.nodes.frames[-1])
@@ -434,17 +432,22 @@ class KeyframeGraph:
     def _is_drift(self, nodes: Sequence[int], solution: Matrix) -> bool:
         """Returns whether the poses [N, 4, 4] of a solution explain most of what loops disagree with the present ones.
 
-        If they do not, loops err by more than the poses: each of them says something else.
+        If they do not, loops err by as much as the poses: each of them says something else, and the poses follow its error.
         """
         T_now, T_then = dict(zip(nodes, self.nodes.T_world_cam[nodes])), dict(zip(nodes, solution))
         loops = [loop for loop in self.loops() if loop.first in T_now and loop.second in T_now]
-        now, then = (sum(np.square(contradiction(loop, T)[:3]).sum() for loop in loops) for T in (T_now, T_then))
+        now, then = (np.square(deviations(loops, T)).sum() for T in (T_now, T_then))
         return bool(then <= (1 - _LEAST_DRIFT) * now)
 
     def _off(self, loop: Link) -> float:
         """Returns by how much a loop would move its second node: m or rad, whichever is more."""
         T = self.nodes.T_world_cam
         return size(se3.inverse(loop.T_first_second) @ motions.between(T[loop.first], T[loop.second]))
+
+    def _most_off(self) -> float:
+        """Returns by how much loops would move their second nodes at most: m or rad, whichever is more."""
+        twists = contradictions(self.loops(), dict(enumerate(self.nodes.T_world_cam)))
+        return float(np.linalg.norm(twists.reshape(-1, 2, 3), axis=2).max(initial=0.0))
 
     def _moved(self, loop: Link) -> Matrix:
         """Returns the motion [4, 4] of the world by which a loop would move its second node."""

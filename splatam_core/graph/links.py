@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core.geometry import motions, se3
-from splatam_core.geometry.se3 import Matrix, Vector
+from splatam_core.geometry.se3 import Matrix
 from splatam_core.graph.pose_graph import Edge
 
 _FAR_M = 5.0  # of a new map that lies beside the old one: more than drift
@@ -89,16 +89,21 @@ def size(T: Matrix) -> float:
     return float(np.linalg.norm(twists.reshape(*twists.shape[:-1], 2, 3), axis=-1).max(initial=0.0))
 
 
-def contradiction(link: Link, T_world_cam: Mapping[int, Matrix]) -> Vector:
-    """Returns the twist [6] by which poses [4, 4], by node, contradict a link."""
-    between = motions.between(T_world_cam[link.first], T_world_cam[link.second])
-    return motions.log(se3.inverse(link.T_first_second) @ between)
+def contradictions(links: Sequence[Link], T_world_cam: Mapping[int, Matrix]) -> Matrix:
+    """Returns the twists [L, 6] by which poses [4, 4], by node, contradict links."""
+    measured = np.array([link.T_first_second for link in links]).reshape(-1, 4, 4)
+    ends = [np.array([T_world_cam[node] for node in nodes]).reshape(-1, 4, 4) for nodes in _ends(links)]
+    return motions.log(se3.inverse(measured) @ motions.between(*ends))
 
 
-def deviations(link: Link, T_world_cam: Mapping[int, Matrix]) -> float:
-    """Returns by how many of the deviations of its kind poses [4, 4], by node, contradict a link, in position or rotation."""
-    lengths = np.linalg.norm(contradiction(link, T_world_cam).reshape(2, 3), axis=1)
-    return float((lengths / _DEVIATIONS[link.kind]).max())
+def deviations(links: Sequence[Link], T_world_cam: Mapping[int, Matrix]) -> Matrix:
+    """Returns [L, 2] by how many of the deviations of their kinds poses [4, 4], by node, contradict links: position, rotation."""
+    lengths = np.linalg.norm(contradictions(links, T_world_cam).reshape(-1, 2, 3), axis=2)
+    return lengths / np.array([_DEVIATIONS[link.kind] for link in links]).reshape(-1, 2)
+
+
+def _ends(links: Sequence[Link]) -> tuple[list[int], list[int]]:
+    return [link.first for link in links], [link.second for link in links]
 
 
 def inverse(covariance: Matrix) -> Matrix:

@@ -12,6 +12,7 @@ from splatam_core.config import load_config
 from splatam_core.geometry import motions, se3
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.graph.keyframe_graph import KeyframeGraph, TrackedFrame
+from splatam_core.graph.links import Kind, Link
 from splatam_core.graph.pairs import PairResult
 from splatam_core.graph.places import NUM_FEATURES, Place
 from splatam_core.images.view import View
@@ -114,6 +115,21 @@ def test_what_agrees_is_left_alone() -> None:
     camera.run()
     assert camera.graph.num_loops > 5 and camera.graph.num_corrections == 0
     assert (camera.graph.nodes.T_world_cam == np.array(camera.published)).all()
+
+
+@pytest.mark.parametrize(('share', 'is_drift'), [(0.8, False), (0.9, True)])
+@pytest.mark.parametrize('twist', [(0.04, 0, 0, 0, 0, 0), (0, 0, 0, 0, 0.02, 0)])
+def test_poses_follow_loops_only_where_these_agree(share: float, is_drift: bool, twist: tuple[float, ...]) -> None:
+    """What is left of the disagreement after optimisation is what loops err by: 80 % are taken away where poses are as good."""
+    off, T = np.array(twist), there_and_back(10)
+    graph = KeyframeGraph(CONFIG, TorchAligner())
+    for number in range(10):
+        graph.nodes = graph.nodes.added(number, number, T[number])
+    measured = [motions.between(T[0], T[node]) @ se3.exp(-off) for node in range(5, 10)]
+    graph._links = [Link.measured(0, 5 + k, motion, Kind.LOOP, 1e-6 * np.eye(6)) for k, motion in enumerate(measured)]
+    solution = T.copy()
+    solution[5:] = [pose @ se3.exp(-(1 - np.sqrt(1 - share)) * off) for pose in T[5:]]
+    assert graph._is_drift(range(10), solution) == is_drift
 
 
 def test_dropped_keyframes_leave_the_graph_small() -> None:
