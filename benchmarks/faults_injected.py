@@ -1,16 +1,17 @@
 """What is said at each frame when a recording is damaged: a covered camera, jumps, no texture, a moving box, and more.
 
-    python benchmarks/faults_injected.py [RECORDING ...] [--frames 150] [--jumps 60] [--preset realtime] [--width 320] [--data DIR]
+    python benchmarks/faults_injected.py [RECORDING ...] [--frames 150] [--jumps 60] [--seed 0] [--preset realtime] [--width 320]
+                                         [--data DIR]
 
 Each fault begins at frame 60 of RECORDING (by default redkitchen_320) and, where it lasts, ends after 15 frames. A line says
 what each frame was called (i = initialized, t = tracked, u = uncertain, L = lost), the largest error of a tracked frame against the
 ground truth, and how many tracked frames were false: farther off than 10 cm and than three standard deviations. --frames 0 leaves
 the faults out.
 
-With --jumps N, N jumps of 2 to 10 frames without a gap in the stamps follow, at random places of the whole recording; each run
-begins 30 frames before and ends 20 after. Errors are those of the pose relative to the last one before the jump. The camera is
-found where one of the first 10 frames is tracked within 10 cm and 6 degrees; `false` counts tracked frames farther off than 10 cm
-and three standard deviations, or than 6 degrees.
+With --jumps N, N jumps of 2 to 10 frames without a gap in the stamps follow, at places of the whole recording that --seed draws;
+each run begins 30 frames before and ends 20 after. Errors are those of the pose relative to the last one before the jump. The
+camera is found where one of the first 10 frames is tracked within 10 cm and 6 degrees; `false` counts tracked frames farther off
+than 10 cm and three standard deviations, or than 6 degrees.
 """
 
 from __future__ import annotations
@@ -220,9 +221,8 @@ def landing(frames: list[Damaged], ground_truth: Trajectory, config: SlamConfig)
     return Landing(found, said=not any(index < BEFORE + SOON for index in tracked), false=false)
 
 
-def jumps(frames: list[RgbdFrame], ground_truth: Trajectory, config: SlamConfig, count: int) -> list[str]:
+def jumps(frames: list[RgbdFrame], ground_truth: Trajectory, config: SlamConfig, rng: np.random.Generator, count: int) -> list[str]:
     """Returns the cells that say what became of random jumps."""
-    rng = np.random.default_rng(0)
     landings = []
     for _ in range(count):
         length, begin = int(rng.integers(2, 11)), int(rng.integers(BEFORE, len(frames) - AFTER - 12))
@@ -254,6 +254,7 @@ def main() -> None:
     parser.add_argument('--width', type=int, default=320)
     parser.add_argument('--frames', type=int, default=150)
     parser.add_argument('--jumps', type=int, default=0)
+    parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--data', type=Path, default=Path(os.environ.get('SPLATAM_DATA', '../shared/data')))
     parser.add_argument('--set', dest='overrides', action='append', default=[], metavar='KEY=VALUE')
     args = parser.parse_args()
@@ -268,10 +269,9 @@ def main() -> None:
     if args.jumps:
         print('\n| ' + ' | '.join(JUMP_COLUMNS) + ' |\n|' + '---|' * len(JUMP_COLUMNS))
         for recording in args.recordings:
-            print(
-                '| ' + ' | '.join([recording, *jumps(*read(args.data / recording, args.width), config, args.jumps)]) + ' |',
-                flush=True,
-            )
+            rng = np.random.default_rng(args.seed)
+            cells = [recording, *jumps(*read(args.data / recording, args.width), config, rng, args.jumps)]
+            print('| ' + ' | '.join(cells) + ' |', flush=True)
 
 
 if __name__ == '__main__':

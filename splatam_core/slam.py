@@ -92,9 +92,7 @@ class Slam(SlamLifecycle):
             return unknown()
         gaussians, time_offset = self.map.gaussians, self._motion.time_offset
         found = [
-            self._tracker.track(
-                view, gaussians, at.T_cam_world, se3.inverse(at.T_world_cam_before), time_offset, readout=at.readout
-            )
+            self._tracker.track(view, gaussians, at.T_cam_world, se3.inverse(at.T_world_cam_before), time_offset, pace=at.pace)
             for at in predictions
         ]
         return self._judge.choose(found, self._with_motion_seen(predictions, found[0], view), self.config.tracking)

@@ -31,12 +31,11 @@ from splatam_core.tracking.aligner import Aligner
 from splatam_core.tracking.base import TrackingResult
 from splatam_core.tracking.features import pose_by_features
 from splatam_core.tracking.gauss_newton import GaussNewton
-from splatam_core.tracking.motion import SeenMotion
+from splatam_core.tracking.motion import Pace, SeenMotion
 from splatam_core.tracking.pyramid import Level, frame_level, full_pyramid, half_pyramid, render_level
-from splatam_core.tracking.readout import ReadoutSeen
 from splatam_core.tracking.time_offset import TimeOffset
 from splatam_core.tracking.torch_aligner import TorchAligner
-from splatam_core.tracking.verdict import better, verify
+from splatam_core.tracking.verdict import better, verify, widened
 
 _LEAST_ERROR_PX = 0.1  # of the motion between two images, along and about each axis: interpolation is no better
 _FAR = 0.05  # m and rad: alignment that has come so far may have found another minimum, and features are asked, too
@@ -50,9 +49,9 @@ class _Frame:
         view: the frame.
         pyramid: the frame at a half, a quarter, ... of its resolution.
         gaussians: the map.
-        T_cam_world_before: [4, 4] pose one frame ago; None if not known.
+        T_cam_world_before: [4, 4] the last pose; None if not known.
         time_offset: between colour and depth, before this frame.
-        readout: see ``Tracker.track``.
+        pace: see ``Tracker.track``.
     """
 
     view: View
@@ -60,7 +59,7 @@ class _Frame:
     gaussians: Gaussians
     T_cam_world_before: Matrix | None
     time_offset: TimeOffset
-    readout: ReadoutSeen | None
+    pace: Pace
 
 
 class AlignmentTracker:
@@ -83,16 +82,19 @@ class AlignmentTracker:
         T_cam_world: Matrix,
         T_cam_world_before: Matrix | None = None,
         time_offset: TimeOffset | None = None,
-        readout: ReadoutSeen | None = None,
+        pace: Pace | None = None,
     ) -> TrackingResult:
         """See ``Tracker.track``."""
         pyramid = half_pyramid(frame_level(view, self._aligner), self._aligner)
-        frame = _Frame(view, pyramid, gaussians, T_cam_world_before, time_offset or TimeOffset(), readout)
+        frame = _Frame(view, pyramid, gaussians, T_cam_world_before, time_offset or TimeOffset(), pace or Pace())
         found = self._align_twice(frame, T_cam_world)
         if not self._config.align.features or (self._is_good(found) and not _is_far(found, T_cam_world)):
             return found
         start = self._pose_by_features(frame, T_cam_world if T_cam_world_before is None else T_cam_world_before)
-        return found if start is None else better(found, self._align_twice(frame, start), self._config)
+        if start is None:
+            return found
+        other = self._align_twice(frame, start)
+        return widened(better(found, other, self._config), [found, other], self._config)
 
     def motion(self, view: View, before: View, T_now_before: Matrix) -> SeenMotion | None:
         """See ``Tracker.motion``."""
@@ -117,7 +119,7 @@ class AlignmentTracker:
         references = self._reference_pyramid(frame, T_cam_world)
         before = frame.T_cam_world_before
         predicted_motion = None if before is None else T_cam_world @ se3.inverse(before)
-        alignment = self._gauss_newton.align(references, frame.pyramid, predicted_motion, frame.time_offset, readout=frame.readout)
+        alignment = self._gauss_newton.align(references, frame.pyramid, predicted_motion, frame.time_offset, pace=frame.pace)
         state, system = alignment.state, alignment.system
         num_readings = int((frame.pyramid[0].depth > 0).sum())
         return TrackingResult(

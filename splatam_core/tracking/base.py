@@ -9,7 +9,7 @@ from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians
 from splatam_core.tracking.evidence import Evidence
-from splatam_core.tracking.motion import SeenMotion
+from splatam_core.tracking.motion import Pace, SeenMotion
 from splatam_core.tracking.readout import ReadoutSeen
 from splatam_core.tracking.time_offset import TimeOffset
 
@@ -49,7 +49,7 @@ class Tracker(Protocol):
         T_cam_world: Matrix,
         T_cam_world_before: Matrix | None = None,
         time_offset: TimeOffset | None = None,
-        readout: ReadoutSeen | None = None,
+        pace: Pace | None = None,
     ) -> TrackingResult:
         """Finds the pose from which the map looks like the view; changes nothing.
 
@@ -57,9 +57,9 @@ class Tracker(Protocol):
             view: what the camera sees.
             gaussians: the map.
             T_cam_world: [4, 4] predicted pose.
-            T_cam_world_before: [4, 4] pose one frame ago; None if not known.
+            T_cam_world_before: [4, 4] the last pose; None if not known.
             time_offset: between colour and depth, as the frames before tell; None if they tell nothing.
-            readout: how long reading an image takes, as the frames before tell; None if they tell nothing.
+            pace: how the camera is expected to move from frame to frame; None if not known.
         """
 
     def motion(self, view: View, before: View, T_now_before: Matrix) -> SeenMotion | None:

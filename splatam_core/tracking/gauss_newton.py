@@ -16,6 +16,7 @@ from splatam_core.geometry import se3
 from splatam_core.geometry.se3 import Matrix
 from splatam_core.tracking.aligner import Aligner, Array, Linearization, LinearSystem
 from splatam_core.tracking.evidence import Evidence, Knowns, max_depth_error, step_of, weigh
+from splatam_core.tracking.motion import Pace
 from splatam_core.tracking.pyramid import EDGE, Level
 from splatam_core.tracking.readout import ReadoutSeen
 from splatam_core.tracking.time_offset import TimeOffset
@@ -27,6 +28,7 @@ _MIN_SCALES = 0.004, 0.001  # no sensor is better
 _MAD_TO_DEVIATION = 1.4826  # standard deviation over median absolute deviation, for a normal distribution
 _LEAST_WEIGHT = 1e-6
 _TWIST, _GAIN_AND_BIAS, _TIME_OFFSET, _READOUT = range(6), range(6, 8), range(8, 9), range(9, 10)  # the unknowns
+_ANY_PACE = Pace()
 _PRIOR = np.array([0.3] * 6 + [0.1] * 2) ** -2  # variance^-1 of a step: m and rad; gain, bias
 
 
@@ -75,8 +77,9 @@ class _Pair:
         reference: the render.
         layers: of the frame, see ``Aligner.layers``.
         depth_share: of the frame, see ``Level``.
-        predicted_motion: [4, 4] from the camera one frame ago to the render's; None if that is not known.
+        predicted_motion: [4, 4] from the camera at the last pose to the render's; None if that is not known.
         time_offset: between colour and depth, before this frame.
+        pace: how the camera is expected to move from frame to frame.
         readout: how long reading an image takes, before this frame; None where it is not estimated.
     """
 
@@ -85,6 +88,7 @@ class _Pair:
     depth_share: float
     predicted_motion: Matrix | None
     time_offset: TimeOffset
+    pace: Pace
     readout: ReadoutSeen | None
 
 
@@ -136,17 +140,17 @@ class GaussNewton:
         time_offset: TimeOffset,
         start_motion: Matrix | None = None,
         *,
-        readout: ReadoutSeen | None = None,
+        pace: Pace = _ANY_PACE,
     ) -> Alignment:
         """Aligns from coarse to fine, starting where the reference was rendered, or at another motion.
 
         Args:
             references: pyramid of the render, finest level first.
             frames: pyramid of the frame, with the same cameras.
-            predicted_motion: [4, 4] from the camera one frame ago to the render's; None if that is not known.
+            predicted_motion: [4, 4] from the camera at the last pose to the render's; None if that is not known.
             time_offset: between colour and depth, before this frame.
             start_motion: [4, 4] from the reference's camera to the frame's; None = none.
-            readout: see ``Tracker.track``; counts where the predicted motion is known.
+            pace: how the camera is expected to move from frame to frame; counts where the predicted motion is known.
 
         Returns:
             The state found, or the start where that explains the finest level better.
@@ -154,14 +158,21 @@ class GaussNewton:
         start = state = AlignmentState(np.eye(4) if start_motion is None else start_motion)
         if self._estimates_time_offset and predicted_motion is not None:
             state = replace(state, time_offset=time_offset.mean)
-        if not self._estimates_readout or predicted_motion is None:
-            readout = None
+        readout = pace.readout if self._estimates_readout and predicted_motion is not None else None
         if readout is not None:
             state = replace(state, readout=readout.mean)
         scales = _FIRST_SCALES
         for reference, frame in zip(reversed(references), reversed(frames), strict=True):
             layers = self._aligner.layers(frame.brightness, frame.depth, EDGE)
-            pair = _Pair(reference, layers, frame.depth_share, predicted_motion, time_offset, readout)
+            pair = _Pair(
+                reference=reference,
+                layers=layers,
+                depth_share=frame.depth_share,
+                predicted_motion=predicted_motion,
+                time_offset=time_offset,
+                pace=pace,
+                readout=readout,
+            )
             state, scales = self._iterate(pair, state, scales)
         system = self._linearize(pair, state, scales)
         after, equations, free = time_offset, _Equations.of(system, state, pair), self._unknowns(pair)
@@ -178,7 +189,7 @@ class GaussNewton:
         """Takes steps at one level until they are small. Returns the state and the scales of the residuals."""
         for _ in range(self._config.iterations):
             if pair.predicted_motion is not None:
-                state = replace(state, velocity=se3.log(state.depth_motion @ pair.predicted_motion))
+                state = replace(state, velocity=pair.pace.twist(state.depth_motion @ pair.predicted_motion))
             system = self._linearize(pair, state, scales)
             scales = _scales(system)
             step = _Equations.of(system, state, pair).step(self._unknowns(pair))

@@ -20,6 +20,38 @@ MAX_EXTRAPOLATION = 5
 """A velocity is extrapolated for at most this many times the interval it was observed over: longer gaps say nothing."""
 
 
+MAX_ACCELERATION, MAX_ANGULAR_ACCELERATION = 10.0, 60.0  # m/s^2, rad/s^2: a jerk of the hand
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pace:
+    """How the camera moves from one frame to the next: by as much of that are colour and depth, and the rows of an image, apart.
+
+    An alignment finds how far a frame is from the last pose. After a jump, or where the last pose was wrong, no camera has moved
+    like that.
+
+    Attributes:
+        num_frames: intervals between frames since the last pose.
+        expected: [6] twist in one of them.
+        limit_m: by how much it may be wrong, metres.
+        limit_rad: by how much its rotation may be wrong.
+        readout: how long reading an image takes, as a fraction of an interval; None if nothing is known about it.
+    """
+
+    num_frames: int = 1
+    expected: Matrix = field(default_factory=lambda: np.zeros(6))
+    limit_m: float = math.inf
+    limit_rad: float = math.inf
+    readout: ReadoutSeen | None = None
+
+    def twist(self, T_now_last: Matrix) -> Matrix:
+        """Returns the twist [6] in one interval, from the motion [4, 4] since the last pose: less of what is not possible."""
+        found = se3.log(T_now_last) / self.num_frames
+        off = found - self.expected
+        excess = max(float(np.linalg.norm(off[:3])) / self.limit_m, float(np.linalg.norm(off[3:])) / self.limit_rad)
+        return found if excess <= 1 else self.expected + off / excess**2
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenMotion:
     """How the camera has moved from one frame to another, as their images tell without the map.
@@ -44,7 +76,7 @@ class Prediction:
         is_guess: True if nothing is known about the motion since then.
         is_measured: True if another sensor has measured it.
         seen: what the images of the two frames tell about it; None where they were not compared.
-        readout: how long reading an image takes, as the frames before tell; None if they tell nothing.
+        pace: how it is expected to move from frame to frame.
     """
 
     T_world_cam: Matrix
@@ -53,7 +85,7 @@ class Prediction:
     is_guess: bool = False
     is_measured: bool = False
     seen: SeenMotion | None = None
-    readout: ReadoutSeen | None = None
+    pace: Pace = field(default_factory=Pace)
 
     @property
     def T_cam_world(self) -> Matrix:
@@ -158,11 +190,27 @@ class MotionModel:
         if not before_ns:
             return Prediction(T_before, T_before, math.inf)
         seconds = 1e-9 * (stamp_ns - before_ns)
-        readout = self.readout.prior(seconds)
-        if self._prior and (step := self._prior(before_ns, stamp_ns)) is not None:
-            return Prediction(T_before @ step, T_before, seconds, is_measured=True, readout=readout)
-        is_guess = self._constant_velocity and not self._velocity.any()
-        return Prediction(self._extrapolated(stamp_ns, before_ns, T_before), T_before, seconds, is_guess, readout=readout)
+        step = self._prior(before_ns, stamp_ns) if self._prior else None
+        is_measured = step is not None
+        T_world_cam = self._extrapolated(stamp_ns, before_ns, T_before) if step is None else T_before @ step
+        is_guess = not is_measured and self._constant_velocity and not self._velocity.any()
+        pace = self._pace(stamp_ns - before_ns, se3.inverse(T_world_cam) @ T_before)
+        return Prediction(T_world_cam, T_before, seconds, is_guess, is_measured, pace=pace)
+
+    def _pace(self, elapsed_ns: int, T_now_before: Matrix) -> Pace:
+        """Returns how the camera moves from frame to frame, from the motion [4, 4] predicted for a time."""
+        num_frames, seconds = self._num_frames(elapsed_ns), 1e-9 * elapsed_ns
+        return Pace(
+            num_frames=num_frames,
+            expected=se3.log(T_now_before) / num_frames,
+            limit_m=MAX_ACCELERATION * seconds**2 / num_frames,
+            limit_rad=MAX_ANGULAR_ACCELERATION * seconds**2 / num_frames,
+            readout=self.readout.prior(seconds / num_frames),
+        )
+
+    def _num_frames(self, elapsed_ns: int) -> int:
+        """Returns how many frame intervals a time is, by the last one over which a velocity was observed."""
+        return max(1, round(elapsed_ns / self._interval_ns)) if self._interval_ns else 1
 
     def predict(self, stamp_ns: int) -> Matrix:
         """Returns the predicted pose [4, 4], camera to world, at a stamp."""
@@ -188,7 +236,8 @@ class MotionModel:
             self._stamp_ns, self._T_world_cam = stamp_ns, T_world_cam
             return
         if readout is not None and self._stamp_ns and self._trusted_ns is None:
-            self.readout = self.readout.updated(readout, 1e-9 * (stamp_ns - self._stamp_ns))
+            elapsed_ns = stamp_ns - self._stamp_ns
+            self.readout = self.readout.updated(readout, 1e-9 * elapsed_ns / self._num_frames(elapsed_ns))
         if self._constant_velocity and self._stamp_ns:
             step = se3.log(se3.inverse(self._T_world_cam) @ T_world_cam)
             self._interval_ns = stamp_ns - self._stamp_ns

@@ -10,8 +10,7 @@ from splatam_core.images.view import View
 from splatam_core.interruption import Stop, never
 from splatam_core.rasterizer import Gaussians, Rasterizer
 from splatam_core.tracking.base import TrackingResult
-from splatam_core.tracking.motion import SeenMotion
-from splatam_core.tracking.readout import ReadoutSeen
+from splatam_core.tracking.motion import Pace, SeenMotion
 from splatam_core.tracking.time_offset import TimeOffset
 
 
@@ -33,7 +32,7 @@ class NullTracker:
         T_cam_world: Matrix,
         T_cam_world_before: Matrix | None = None,
         time_offset: TimeOffset | None = None,
-        readout: ReadoutSeen | None = None,
+        pace: Pace | None = None,
     ) -> TrackingResult:
         """See ``Tracker.track``."""
         return TrackingResult(T_cam_world, T_cam_world, num_readings=None, visible_fraction=1.0, inlier_fraction=1.0)

@@ -17,8 +17,7 @@ from splatam_core.rasterizer import Gaussians, Rasterizer
 from splatam_core.tracking.base import TrackingResult
 from splatam_core.tracking.candidate import Candidate
 from splatam_core.tracking.loss import TrackingLoss, tracking_loss
-from splatam_core.tracking.motion import SeenMotion
-from splatam_core.tracking.readout import ReadoutSeen
+from splatam_core.tracking.motion import Pace, SeenMotion
 from splatam_core.tracking.time_offset import TimeOffset
 from splatam_core.tracking.verdict import compare
 
@@ -40,7 +39,7 @@ class RenderAndCompareTracker:
         T_cam_world: Matrix,
         T_cam_world_before: Matrix | None = None,
         time_offset: TimeOffset | None = None,
-        readout: ReadoutSeen | None = None,
+        pace: Pace | None = None,
     ) -> TrackingResult:
         """See ``Tracker.track``."""
         config, gaussians = self._config, gaussians.detached()

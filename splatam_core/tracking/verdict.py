@@ -23,7 +23,7 @@ from splatam_core.images.view import View
 from splatam_core.rasterizer import Render
 from splatam_core.tracking.base import TrackingResult
 from splatam_core.tracking.evidence import Evidence
-from splatam_core.tracking.motion import Prediction
+from splatam_core.tracking.motion import MAX_ACCELERATION, MAX_ANGULAR_ACCELERATION, Prediction
 from splatam_core.types import PoseCovariance, Status
 
 DRIFT_PER_ROOT_METRE = 0.0075
@@ -32,7 +32,6 @@ DRIFT_PER_ROOT_METRE = 0.0075
 DEVIATIONS = 3.0
 """A pose is taken to be off by at most this many standard deviations."""
 
-MAX_ACCELERATION, MAX_ANGULAR_ACCELERATION = 10.0, 60.0  # m/s^2, rad/s^2: a jerk of the hand
 SAME_PLACE = 0.1  # m and rad: explanations that are nearer to each other are one
 _MUCH_BETTER = 1.05  # times as many cells
 _FINE_PIXEL_RAD = 0.01  # wider pixels leave more open: at half size, those of images less than some 250 pixels wide
@@ -86,11 +85,29 @@ def better(first: TrackingResult, second: TrackingResult, config: TrackingConfig
     return second if _support(second, config) > _MUCH_BETTER * _support(first, config) else first
 
 
+def widened(best: TrackingResult, found: Sequence[TrackingResult], config: TrackingConfig) -> TrackingResult:
+    """Returns the best of the poses found for a frame, with how far others are from it as part of its covariance.
+
+    Only those count that explain the frame as well: each of them may be the right one.
+    """
+    if best.evidence is None:
+        return best
+    alike = [result for result in found if result is best or _explain_alike(best, result, config)]
+    apart = np.array([se3.log(result.T_cam_world_depth @ se3.inverse(best.T_cam_world_depth)) for result in alike])
+    covariance = best.evidence.covariance + apart.T @ apart / len(alike)
+    return replace(best, evidence=replace(best.evidence, covariance=covariance))
+
+
+def _explain_alike(first: TrackingResult, second: TrackingResult, config: TrackingConfig) -> bool:
+    """Returns whether two poses of a frame explain about as much of it."""
+    supports = sorted(_support(result, config) for result in (first, second))
+    return supports[0] > 0 and supports[1] <= _MUCH_BETTER * supports[0]
+
+
 def are_equal(first: TrackingResult, second: TrackingResult, config: TrackingConfig) -> bool:
     """Returns whether two poses of a frame are far apart and explain it equally well."""
-    apart = np.linalg.norm(se3.log(first.T_cam_world @ se3.inverse(second.T_cam_world)).reshape(2, 3), axis=1).max()
-    supports = sorted(_support(result, config) for result in (first, second))
-    return bool(apart > SAME_PLACE) and supports[0] > 0 and supports[1] <= _MUCH_BETTER * supports[0]
+    apart = se3.log(first.T_cam_world @ se3.inverse(second.T_cam_world))
+    return max(_lengths(apart)) > SAME_PLACE and _explain_alike(first, second, config)
 
 
 def _support(result: TrackingResult, config: TrackingConfig) -> float:
@@ -214,7 +231,7 @@ class Judge:
         if best:
             self.state = replace(self.state, has_jumped=False)  # it has not: there is a better explanation
         is_ambiguous = any(result is not found[best] and are_equal(found[best], result, config) for result in found)
-        return self.decide(found[best], predictions[best], config, is_ambiguous=is_ambiguous)
+        return self.decide(widened(found[best], found, config), predictions[best], config, is_ambiguous=is_ambiguous)
 
     def decide(
         self, result: TrackingResult, prediction: Prediction, config: TrackingConfig, is_ambiguous: bool = False
@@ -241,18 +258,20 @@ class Judge:
         gone = (step, result.evidence.covariance) if prediction.seen is None else (blend.combined, blend.covariance)
         jump = self._jump(*gone, prediction)
         allowed_m = _allowed_m(result.evidence, config) * (_REENTRY if self.state.is_in_doubt else 1)
-        weakness = _weakness(result.evidence, blend.covariance, allowed_m, config)
-        if not weakness and is_ambiguous:
-            weakness = 'two places explain the view equally well'
+        weakness = 'two places explain the view equally well' if is_ambiguous else ''
+        weakness = weakness or _weakness(result.evidence, blend.covariance, allowed_m, config)
         corrects = self.state.has_jumped and not weakness and not jump
         if not result.evidence.num_open:
             self._learn(step, result.evidence.covariance, prediction.seconds)
         reason = weakness or jump
         if not reason:
-            self._drift_on(sum(_lengths(se3.log(result.T_cam_world_depth @ prediction.T_world_cam_before))), blend.guessed)
+            way = sum(_lengths(se3.log(result.T_cam_world_depth @ prediction.T_world_cam_before)))
+            # After frames in doubt, what is mapped from here on is as far off as this pose.
+            self._drift_on(way, blend.covariance if self.state.is_in_doubt else blend.guessed)
+        is_elsewhere = bool(jump) or is_ambiguous  # or where it was expected: the next pose must not be drawn to this one
         self.state = replace(
             self.state,
-            covariance=blend.covariance,
+            covariance=blend.covariance + is_elsewhere * np.outer(step, step),
             has_jumped=bool(jump),
             is_in_doubt=bool(reason),
             unseen_s=blend.unseen_share * (self.state.unseen_s + min(prediction.seconds, _LONGEST_GAP)),

@@ -26,6 +26,7 @@ from splatam_core.slam import Slam
 from splatam_core.tracking import make_tracker
 from splatam_core.tracking.features import pose_by_features
 from splatam_core.tracking.motion import MotionModel
+from splatam_core.tracking.time_offset import TimeOffset
 from splatam_core.tracking.verdict import verify
 from splatam_core.types import FrameResult, RgbdFrame, Status
 
@@ -291,6 +292,31 @@ def test_colour_that_lags_depth_is_noticed(lag: bool, room: tuple[list[RgbdFrame
     ]
     step = np.linalg.norm(se3.rotation_vector((se3.inverse(truth[6]) @ truth[7])[:3, :3]))
     assert (max(errors) < 0.5 * step) == lag
+
+
+def test_a_jump_is_no_motion_that_colour_is_late_by(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
+    """Colour one frame later than depth, after a jump of five: it is late by a step of the camera, not by the jump.
+
+    Taken for motion, the jump turns colour by 0.6 degrees, a pixel, against depth for each frame that it spans; a tenth of that is
+    what is left of it.
+    """
+    frames, truth = room
+    slam = _slam('mapping.iterations=10', 'tracking.method=align')
+    for frame in frames[:4]:
+        slam.process(frame)
+    view = View.from_frame(dataclasses.replace(frames[8], rgb=frames[9].rgb), slam.config.depth)
+    tracker = make_tracker(make_rasterizer('cpu', 1), TrackingConfig(method='align', iterations=12))
+    motion = MotionModel(constant_velocity=True)
+    for index in (2, 3):
+        motion.observe(frames[index].stamp_ns, truth[index])
+    prediction = motion.predictions(frames[4].stamp_ns)[0]
+    before, known = se3.inverse(prediction.T_world_cam_before), TimeOffset(mean=1.0, variance=0.1**2)
+    off_deg = {}
+    for pace in (prediction.pace, None):
+        found = tracker.track(view, slam.map.gaussians, prediction.T_cam_world, before, known, pace=pace)
+        pairs = (found.T_cam_world, truth[9]), (found.T_cam_world_depth, truth[8])
+        off_deg[pace] = max(np.degrees(np.linalg.norm(se3.rotation_vector((T @ true)[:3, :3]))) for T, true in pairs)
+    assert off_deg[prediction.pace] < 0.5 < 1.2 < off_deg[None]
 
 
 def test_a_frame_that_fits_poorly_is_aligned_once_more(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:

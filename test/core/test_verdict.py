@@ -16,7 +16,7 @@ from splatam_core.rasterizer.native import make_native_aligner
 from splatam_core.tracking.base import TrackingResult
 from splatam_core.tracking.evidence import Evidence
 from splatam_core.tracking.gauss_newton import Alignment, GaussNewton
-from splatam_core.tracking.motion import MotionModel, SeenMotion
+from splatam_core.tracking.motion import MAX_ACCELERATION, MotionModel, SeenMotion
 from splatam_core.tracking.pyramid import Level
 from splatam_core.tracking.time_offset import TimeOffset
 from splatam_core.tracking.verdict import Judge, Verdict
@@ -214,6 +214,47 @@ def test_two_places_that_explain_a_view_equally_well_are_uncertain(bench: Bench)
     assert bench.feed(result(at(HERE + 0.3))).status is Status.UNCERTAIN
     verdict = bench.feed(result(at(HERE + 0.3 + STEP)), result(at(HERE + 2 * STEP)))
     assert verdict.status is Status.UNCERTAIN and 'two places' in verdict.reason
+
+
+def test_poses_that_explain_a_view_alike_make_each_other_uncertain(bench: Bench) -> None:
+    """After a jump alignment ends in one place from here, and 5 cm away from there; each of them claims 3 mm."""
+    assert bench.feed(result(at(HERE + 0.3))).status is Status.UNCERTAIN
+    verdict = bench.feed(result(at(HERE + 0.3 + STEP)), result(at(HERE + 0.35 + STEP)))
+    assert verdict.status is Status.UNCERTAIN and 'may be off by' in verdict.reason
+    verdict = bench.feed(result(at(HERE + 0.3 + 2 * STEP)), result(at(HERE + 0.302 + 2 * STEP)))
+    assert verdict.status is Status.TRACKED and verdict.covariance is not None
+    deviation = np.sqrt(verdict.covariance.relative[0, 0])
+    assert deviation == pytest.approx(np.sqrt((0.003 * np.sqrt(3)) ** 2 / 3 + 0.002**2 / 2), rel=0.05)
+
+
+def test_what_is_mapped_after_a_jump_stays_as_far_off_as_its_first_pose(bench: Bench) -> None:
+    before = bench.judge.state.position_drift
+    bench.feed(result(at(HERE + 0.3)))
+    for index, deviation in enumerate((0.003, 0.001, 0.001), start=1):
+        found = [result(at(HERE + 0.3 + index * STEP), deviation=deviation) for _ in range(2)]
+        verdict = bench.feed(*found)
+        assert verdict.status is Status.TRACKED and verdict.covariance is not None
+    added = verdict.covariance.drift_position_m**2 - before
+    assert added == pytest.approx(0.0075**2 * 3 * STEP + 3 * 0.003**2, rel=1e-3)  # the way, and once the pose
+
+
+def test_a_jump_is_no_pace(bench: Bench) -> None:
+    """Nor is the way from a pose that was wrong; over a gap, and from an older pose, it is that of several frames."""
+    predicted, dt = bench.motion.predictions(bench.stamp_ns + FRAME_NS)[0], 1e-9 * FRAME_NS
+
+    def pace(moved_m: float) -> float:
+        T_now_last = se3.inverse(at(moved_m))
+        return -predicted.pace.twist(T_now_last)[0]
+
+    limit_m = MAX_ACCELERATION * dt**2
+    assert pace(STEP + 0.9 * limit_m) == pytest.approx(STEP + 0.9 * limit_m)
+    assert pace(STEP + 2 * limit_m) == pytest.approx(STEP + limit_m / 2)
+    assert pace(STEP + 20 * limit_m) == pytest.approx(STEP + limit_m / 20)
+    late = bench.motion.predictions(bench.stamp_ns + 3 * FRAME_NS)[0].pace
+    assert late.num_frames == 3
+    np.testing.assert_allclose(late.twist(se3.inverse(at(3 * STEP))), [-STEP, 0, 0, 0, 0, 0], atol=1e-12)
+    bench.feed(result(at(HERE + 0.3)))
+    assert [at.pace.num_frames for at in bench.motion.predictions(bench.stamp_ns + FRAME_NS)] == [1, 2]
 
 
 def test_a_camera_may_have_gone_far_in_a_gap(bench: Bench) -> None:
