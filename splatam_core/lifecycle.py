@@ -187,8 +187,7 @@ class SlamLifecycle:
             )
         mapper = self._new_mapper()
         mapper.map.append(replace(gaussians, anchors=None))  # of frames of another run
-        for keyframe in saved.keyframes:
-            mapper.keyframes.append(keyframe)
+        mapper.adopt(saved.keyframes)
         self.reset()
         self._mapper = mapper
         self.graph.load(self.keyframes)

@@ -12,7 +12,7 @@ import pytest
 CSRC = Path(__file__).resolve().parents[1] / 'splatam_core/csrc'
 ARM = 'aarch64-linux-gnu'
 # The last two may be inlined into others.
-KERNELS = ('project', 'forward', 'fit', 'update', 'align', 'backward_tile', 'blend_back')
+KERNELS = ('project', 'forward', 'fit', 'project_back', 'update', 'align', 'backward_tile', 'blend_back')
 # Arithmetic on single values; a register of one value is called s0 or d0, a vector v0.4s.
 SCALAR = re.compile(r'^f(?!mov|cvt)\w+\s+[sd]\d+, (?!v)')
 VECTOR = re.compile(r'^f(?!mov)\w+\s+v\d+')

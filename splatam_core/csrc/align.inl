@@ -63,17 +63,26 @@ static inline Moved moved(const Pose& motion, Lanes px, Lanes py, Lanes pz, IntL
   return p;
 }
 
+constexpr int kProducts = kUnknowns * (kUnknowns + 1) / 2;
+
 // The sums over a row, one lane per pixel modulo eight.
 struct RowSums {
-  Lanes H[kUnknowns * (kUnknowns + 1) / 2], g[kUnknowns], cost;
+  Lanes values[kProducts + kUnknowns + 2];    // H, g, cost and nothing: whole groups of eight
   IntLanes points, compared, seen, agreeing;  // negative
+  Lanes* H() { return values; }
+  Lanes* g() { return values + kProducts; }
+  Lanes& cost() { return values[kProducts + kUnknowns]; }
 };
+static_assert(sizeof(RowSums::values) % (8 * sizeof(Lanes)) == 0, "eight are summed at once");
 
 // Not inlined: it runs once per row, and would take registers from the pixels' loop.
 __attribute__((noinline)) static void add(AlignmentSums& sums, const RowSums& row) {
-  for (int i = 0; i < kUnknowns * (kUnknowns + 1) / 2; ++i) sums.H[i] += sum(row.H[i]);
-  for (int i = 0; i < kUnknowns; ++i) sums.g[i] += sum(row.g[i]);
-  sums.cost += sum(row.cost);
+  constexpr int kCount = sizeof row.values / sizeof(Lanes);
+  float totals[kCount];
+  for (int i = 0; i < kCount; i += 8) store(totals + i, row_sums(row.values + i));
+  for (int i = 0; i < kProducts; ++i) sums.H[i] += totals[i];
+  for (int i = 0; i < kUnknowns; ++i) sums.g[i] += totals[kProducts + i];
+  sums.cost += totals[kProducts + kUnknowns];
   sums.points -= sum(row.points), sums.compared -= sum(row.compared);
   sums.seen -= sum(row.seen), sums.agreeing -= sum(row.agreeing);
 }
@@ -142,20 +151,20 @@ static void align(const float* brightness, const float* depth, const Camera& cam
       const Lanes depth_squared = depth_residual * depth_residual * depth_precision;
       const Lanes photometric_weight = robust_weight(photometric_squared) * photometric_precision;
       const Lanes depth_weight = robust_weight(depth_squared) * depth_precision;
-      total.cost +=
+      total.cost() +=
           keep(seen, photometric_squared / (5.0f + photometric_squared) + depth_squared / (5.0f + depth_squared));
       int entry = 0;
       for (int i = 0; i < kUnknowns; ++i) {
         const Lanes weighted_photometric = by_photometric[i] * photometric_weight;
         if (i < 6) {
           const Lanes weighted_depth = by_depth[i] * depth_weight;
-          total.g[i] += weighted_photometric * photometric_residual + weighted_depth * depth_residual;
+          total.g()[i] += weighted_photometric * photometric_residual + weighted_depth * depth_residual;
           for (int k = i; k < 6; ++k)
-            total.H[entry++] += weighted_photometric * by_photometric[k] + weighted_depth * by_depth[k];
-          for (int k = 6; k < kUnknowns; ++k) total.H[entry++] += weighted_photometric * by_photometric[k];
+            total.H()[entry++] += weighted_photometric * by_photometric[k] + weighted_depth * by_depth[k];
+          for (int k = 6; k < kUnknowns; ++k) total.H()[entry++] += weighted_photometric * by_photometric[k];
         } else {
-          total.g[i] += weighted_photometric * photometric_residual;
-          for (int k = i; k < kUnknowns; ++k) total.H[entry++] += weighted_photometric * by_photometric[k];
+          total.g()[i] += weighted_photometric * photometric_residual;
+          for (int k = i; k < kUnknowns; ++k) total.H()[entry++] += weighted_photometric * by_photometric[k];
         }
       }
     }

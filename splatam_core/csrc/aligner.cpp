@@ -11,6 +11,9 @@ namespace splatam {
 namespace {
 
 constexpr float kNone = std::numeric_limits<float>::quiet_NaN();
+constexpr float kMinSilhouette = 0.5f;  // where less is covered, a render has no depth
+
+float luminance(float red, float green, float blue) { return 0.299f * red + 0.587f * green + 0.114f * blue; }
 constexpr int kRowsPerPiece = 16;  // of an image, or columns
 
 int pieces_of(int rows) { return (rows + kRowsPerPiece - 1) / kRowsPerPiece; }
@@ -47,7 +50,7 @@ void add(Aligner::RowMoments& total, const Aligner::RowMoments& part) {
   for (int i = 0; i < kUnknowns; ++i) total.g1[i] += part.g1[i];
 }
 
-// See Aligner::fill_holes; one row or column of count pixels, stride floats apart.
+// See Aligner::frame_images; one row or column of count pixels, stride floats apart.
 void fill_line(float* line, int count, std::size_t stride, int max_gap, float max_step) {
   int before = -1;
   for (int i = 0; i < count; ++i) {
@@ -137,12 +140,34 @@ void Aligner::halve(const float* brightness, const float* depth, int width, int 
   });
 }
 
-void Aligner::fill_holes(float* depth, int width, int height, int max_gap, float max_step) {
+void Aligner::frame_images(const std::uint8_t* rgb, const float* readings, int width, int height, int max_gap,
+                           float max_step, float* brightness, float* depth) {
   for_rows(height, [&](int, int, int begin, int end) {
-    for (int y = begin; y < end; ++y) fill_line(depth + std::size_t(y) * width, width, 1, max_gap, max_step);
+    for (int y = begin; y < end; ++y) {
+      const std::size_t row = std::size_t(y) * width;
+      for (std::size_t at = row; at < row + width; ++at) {
+        brightness[at] = luminance(rgb[3 * at], rgb[3 * at + 1], rgb[3 * at + 2]) / 255.0f;
+        depth[at] = readings[at] > 0.0f ? readings[at] : kNone;
+      }
+      fill_line(depth + row, width, 1, max_gap, max_step);
+    }
   });
   for_rows(width, [&](int, int, int begin, int end) {
     for (int x = begin; x < end; ++x) fill_line(depth + x, height, std::size_t(width), max_gap, max_step);
+  });
+}
+
+void Aligner::render_images(const ConstImages& drawn, int width, int height, float threshold, float least,
+                            float* brightness, float* depth) {
+  const std::size_t plane = std::size_t(width) * height;
+  const float least_covered = std::max(threshold, least);
+  for_rows(height, [&](int, int, int begin, int end) {
+    for (std::size_t at = std::size_t(begin) * width; at < std::size_t(end) * width; ++at) {
+      const float silhouette = drawn.silhouette[at];
+      brightness[at] = luminance(drawn.rgb[at], drawn.rgb[at + plane], drawn.rgb[at + 2 * plane]) /
+                       std::max(silhouette, least_covered);
+      depth[at] = silhouette > threshold && silhouette >= kMinSilhouette ? drawn.depth[at] / silhouette : kNone;
+    }
   });
 }
 

@@ -42,9 +42,16 @@ class Aligner {
   void halve(const float* brightness, const float* depth, int width, int height, float max_step, float* half_brightness,
              float* half_depth);
 
-  // Closes holes of at most max_gap pixels, along rows and then along columns, where the depths on both sides differ by
-  // at most the fraction max_step of the nearer one. In place. Inverse depth is interpolated: exact on a plane.
-  void fill_holes(float* depth, int width, int height, int max_gap, float max_step);
+  // Writes the brightness of a frame's colours [H, W, 3], and its depth with holes of at most max_gap pixels closed,
+  // along rows and then along columns, where the depths on both sides differ by at most the fraction max_step of the
+  // nearer one. Inverse depth is interpolated: exact on a plane. 0 is no reading.
+  void frame_images(const std::uint8_t* rgb, const float* readings, int width, int height, int max_gap, float max_step,
+                    float* brightness, float* depth);
+
+  // Writes the brightness of a render without the black behind it, and its depth; NaN where the silhouette is not above
+  // `threshold`. The silhouette counts as at least `least`.
+  void render_images(const ConstImages& drawn, int width, int height, float threshold, float least, float* brightness,
+                     float* depth);
 
   // Writes the layers [H, W, kLayers] of an image. Depth is NaN where it changes by more than the fraction max_step
   // from one pixel to the next.

@@ -264,18 +264,33 @@ py::tuple halve(Aligner& aligner, const py::object& brightness, const py::object
   return py::make_tuple(half_brightness, half_depth);
 }
 
-Array fill_holes(Aligner& aligner, const py::object& depth, int max_gap, float max_step) {
+py::tuple frame_images(Aligner& aligner, const py::object& rgb8, const py::object& depth, int max_gap, float max_step) {
   const Size size = size_of(depth, "depth");
   const float* readings = values<float>(depth, "depth", {size.height, size.width});
-  Array result({size.height, size.width});
-  float* filled = result.mutable_data();
-  const auto count = std::size_t(size.width * size.height);
+  const std::uint8_t* colors = values<std::uint8_t>(rgb8, "rgb8", {size.height, size.width, 3});
+  Array brightness({size.height, size.width}), filled({size.height, size.width});
+  float *brightness_out = brightness.mutable_data(), *depth_out = filled.mutable_data();
   {
     py::gil_scoped_release release;
-    std::copy_n(readings, count, filled);
-    aligner.fill_holes(filled, int(size.width), int(size.height), max_gap, max_step);
+    aligner.frame_images(colors, readings, int(size.width), int(size.height), max_gap, max_step, brightness_out,
+                         depth_out);
   }
-  return result;
+  return py::make_tuple(brightness, filled);
+}
+
+py::tuple render_images(Aligner& aligner, const py::object& rgb, const py::object& depth_acc,
+                        const py::object& silhouette, float threshold, float least) {
+  const Size size = size_of(depth_acc, "depth_acc");
+  const ConstImages drawn{values<float>(rgb, "rgb", {3, size.height, size.width}),
+                          values<float>(depth_acc, "depth_acc", {size.height, size.width}),
+                          values<float>(silhouette, "silhouette", {size.height, size.width})};
+  Array brightness({size.height, size.width}), depth({size.height, size.width});
+  float *brightness_out = brightness.mutable_data(), *depth_out = depth.mutable_data();
+  {
+    py::gil_scoped_release release;
+    aligner.render_images(drawn, int(size.width), int(size.height), threshold, least, brightness_out, depth_out);
+  }
+  return py::make_tuple(brightness, depth);
 }
 
 Array layers(Aligner& aligner, const py::object& brightness, const py::object& depth, float max_step) {
@@ -352,7 +367,9 @@ void bind_aligner(py::module_& module) {
       .def("linearize", &linearize, py::arg("at"), py::kw_only(), py::arg("inlier_color"), py::arg("inlier_depth"))
       .def("evidence", &evidence, py::arg("at"), py::kw_only(), py::arg("max_depth_error"), py::arg("step"))
       .def("halve", &halve, py::arg("brightness"), py::arg("depth"), py::arg("max_step"))
-      .def("fill_holes", &fill_holes, py::arg("depth"), py::arg("max_gap"), py::arg("max_step"))
+      .def("frame_images", &frame_images, py::arg("rgb8"), py::arg("depth"), py::arg("max_gap"), py::arg("max_step"))
+      .def("render_images", &render_images, py::arg("rgb"), py::arg("depth_acc"), py::arg("silhouette"),
+           py::arg("threshold"), py::arg("least"))
       .def("layers", &layers, py::arg("brightness"), py::arg("depth"), py::arg("max_step"));
 }
 

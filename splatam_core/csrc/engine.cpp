@@ -12,8 +12,6 @@
 namespace splatam {
 namespace {
 
-#include "projection.inl"
-
 constexpr int kDigitBits = 10, kDigitsOfDepth = 3;  // hold every depth from 0.2 m on
 constexpr std::size_t kDigits = std::size_t(1) << kDigitBits;
 
@@ -299,28 +297,6 @@ void Engine::project_block(View& view, std::size_t block, const GaussianArrays& 
 
 namespace {
 
-// Adds a splat's gradient to the pose's, and writes its Gaussian's where that is wanted.
-void project_backward(const View& view, std::size_t splat, const SplatGradient& g, const GaussianArrays& gaussians,
-                      const MapGradients& map, double pose_gradient[12]) {
-  const std::size_t id = view.ids[splat];
-  const GaussianGradient<float> by_gaussian = through_projection(view.splats[splat], g, view.camera);
-  const float *mean = gaussians.means + 3 * id, *d = by_gaussian.camera;
-  for (int row = 0; row < 3; ++row) {
-    for (int column = 0; column < 3; ++column) pose_gradient[4 * row + column] += double(d[row]) * mean[column];
-    pose_gradient[4 * row + 3] += d[row];
-  }
-  if (map.means)
-    for (int axis = 0; axis < 3; ++axis)
-      map.means[3 * id + axis] = view.pose.R[axis] * d[0] + view.pose.R[3 + axis] * d[1] + view.pose.R[6 + axis] * d[2];
-  if (map.log_scales) map.log_scales[id] = by_gaussian.log_scale;
-  if (map.logit_opacities) map.logit_opacities[id] = by_gaussian.logit_opacity;
-  if (map.rgb) {
-    map.rgb[3 * id] = g.r;
-    map.rgb[3 * id + 1] = g.g;
-    map.rgb[3 * id + 2] = g.b;
-  }
-}
-
 // Clears the gradients of a row's members and returns them.
 SplatGradient* cleared_gradients(View& view, int row) {
   SplatGradient* gradients = view.gradients.data() + view.member_begins[row];
@@ -361,8 +337,9 @@ void Engine::backward(View& view, const GaussianArrays& gaussians, const ConstIm
   for_blocks(view, [&](std::size_t block) {
     BlockGradients sums;
     sum_gradients(view, block, sums);
-    for (std::size_t i = 0; i < view.block_sizes[block]; ++i)
-      project_backward(view, block * kBlock + i, sums[i], gaussians, map, pose_sums[block].data());
+    kernels_.project_back(view.splats.data() + block * kBlock, view.ids.data() + block * kBlock, sums.data(),
+                          view.block_sizes[block], view.camera, view.pose, gaussians.means, map,
+                          pose_sums[block].data());
   });
   for (int entry = 0; entry < 12; ++entry) {
     double sum = 0.0;
@@ -399,7 +376,7 @@ double Engine::fit(const MutableGaussians& gaussians, std::size_t count, float* 
     if (view->block_sizes[block] == 0) return;
     BlockGradients sums;
     sum_gradients(*view, block, sums);
-    kernels_.update(view->splats.data() + block * kBlock, view->ids.data() + block * kBlock, sums.data(), 0,
+    kernels_.update(view->splats.data() + block * kBlock, view->ids.data() + block * kBlock, sums.data(),
                     view->block_sizes[block], camera, pose, gaussians, adam, rates,
                     bounds ? bounds + kBounds * block : nullptr);
   });

@@ -61,10 +61,6 @@ struct View {
   std::size_t num_members(int row) const { return member_begins[row + 1] - member_begins[row]; }
 };
 
-struct MapGradients {  // null where a gradient is not wanted
-  float *means, *log_scales, *logit_opacities, *rgb;
-};
-
 // Its results do not depend on the number of threads, bit for bit. Calls may come from several threads; one that
 // finds the engine at work waits.
 class Engine : public std::enable_shared_from_this<Engine> {

@@ -74,6 +74,10 @@ struct MutableGaussians {
   float *means, *log_scales, *logit_opacities, *rgb;
 };
 
+struct MapGradients {  // null where a gradient is not wanted
+  float *means, *log_scales, *logit_opacities, *rgb;
+};
+
 // The images that a view is fitted to, and the weights of a difference per pixel and channel.
 struct Target {
   const std::uint8_t* rgb;  // [H, W, 3]
@@ -145,11 +149,16 @@ struct Kernels {
   double (*fit)(const TileList&, const Splat* splats, const Camera&, const Target&, float* footprints,
                 SplatGradient* gradients);
 
-  // Takes an Adam step of the Gaussians ids[i], i in [begin, end), whose splats have gradients. Extends the bounds of
-  // their block.
-  void (*update)(const Splat* splats, const std::uint32_t* ids, const SplatGradient* gradients, std::size_t begin,
-                 std::size_t end, const Camera&, const Pose&, const MutableGaussians&, const AdamState&,
-                 const AdamRates&, float* bounds);
+  // Writes the gradients of `count` splats by the Gaussians ids[i], where they are wanted, and adds those by the upper
+  // three rows of the pose.
+  void (*project_back)(const Splat*, const std::uint32_t* ids, const SplatGradient*, std::size_t count, const Camera&,
+                       const Pose&, const float* means, const MapGradients&, double* pose_gradient);
+
+  // Takes an Adam step of the Gaussians ids[i] of `count` splats that have gradients. Extends the bounds of their
+  // block.
+  void (*update)(const Splat* splats, const std::uint32_t* ids, const SplatGradient* gradients, std::size_t count,
+                 const Camera&, const Pose&, const MutableGaussians&, const AdamState&, const AdamRates&,
+                 float* bounds);
 
   // Linearises the residuals of rows [begin, end) of a reference [H, W] in a frame, and counts the inliers. The frame's
   // colour may have been taken at another time than its depth, so each has its own camera motion.

@@ -338,6 +338,14 @@ static inline void blend_back(PixelGradients* rows, const Splat& s, const Corner
   store(into, load(into) + row_sums(sums));
 }
 
+// The members of a row do not fit into the first cache, and are used in the order of their depth.
+constexpr std::size_t kAhead = 8;
+
+static inline void fetch(const Splat* splats, SplatGradient* gradients, std::uint32_t member) {
+  __builtin_prefetch(splats + member);
+  __builtin_prefetch(gradients + member, 1);
+}
+
 template <bool kMap>
 static inline void backward_tile(const TileList& tile, const Splat* splats, const Camera& camera,
                                  const ConstImages& drawn, const ConstImages& gradient, SplatGradient* gradients) {
@@ -357,6 +365,7 @@ static inline void backward_tile(const TileList& tile, const Splat* splats, cons
   Groups open = kAllGroups;
   for (std::size_t k = 0; k < tile.count; ++k) {
     if (k % 8 == 7 && (open = open_groups(rows)) == 0) break;
+    if (k + kAhead < tile.count) fetch(splats, gradients, tile.splats[k + kAhead]);
     const Splat& s = splats[tile.splats[k]];
     const Footprint f = footprint(s, at);
     const Groups reached = groups_of(bits_of_mask(reached_rows(f))) & open;
@@ -484,6 +493,7 @@ static double fit(const TileList& tile, const Splat* splats, const Camera& camer
   const RowNumbers numbers;
   for (std::size_t k = 0; k < count; ++k) {
     const std::uint32_t member = tile.splats[k];
+    if (k + kAhead < count) fetch(splats, gradients, tile.splats[k + kAhead]);
     blend_back<true, false>(rows, splats[member], at, footprints[k], numbers, groups[k], gradients[member]);
   }
   return loss;
@@ -504,24 +514,27 @@ struct BiasCorrections {
 };
 static constexpr BiasCorrections kBiasCorrections;
 
-// Writes the gradients by the Gaussians of eight splats: mean, log scale, logit opacity and rgb, in the order of
-// the moments. Returns which splats have any, as a bit per splat.
+// Writes the gradients by the Gaussians of eight splats: mean in the camera's axes, log scale, logit opacity and rgb,
+// in the order of the moments, a lane per splat. Returns which splats have any, as a bit per splat.
 static inline unsigned by_gaussians(const Splat* splats, const SplatGradient* gradients, const Camera& camera,
-                                    const Pose& pose, Lanes* by_gaussian) {
+                                    Lanes* by_gaussian) {
   Lanes s[8], g[8];
   for (int i = 0; i < 8; ++i) s[i] = load(&splats[i].u), g[i] = load(&gradients[i].log_alpha);
   transpose(s), transpose(g);
   const BasicSplat<Lanes> splat{s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7]};
   const BasicSplatGradient<Lanes> gradient{g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7]};
   const GaussianGradient<Lanes> by = through_projection(splat, gradient, camera);
-  const float* R = pose.R;
-  for (int axis = 0; axis < 3; ++axis)
-    by_gaussian[axis] = R[axis] * by.camera[0] + R[3 + axis] * by.camera[1] + R[6 + axis] * by.camera[2];
+  for (int axis = 0; axis < 3; ++axis) by_gaussian[axis] = by.camera[axis];
   by_gaussian[3] = by.log_scale, by_gaussian[4] = by.logit_opacity;
   by_gaussian[5] = gradient.r, by_gaussian[6] = gradient.g, by_gaussian[7] = gradient.b;
-  transpose(by_gaussian);
   return bits_of_mask((gradient.log_alpha != 0.0f) | (gradient.r != 0.0f) | (gradient.g != 0.0f) |
                       (gradient.b != 0.0f) | (gradient.z != 0.0f));
+}
+
+// Turns the gradients by eight means from the camera's axes to the world's, in place.
+static inline void turn_to_world(const Pose& pose, Lanes* by_mean) {
+  const Lanes x = by_mean[0], y = by_mean[1], z = by_mean[2];
+  for (int axis = 0; axis < 3; ++axis) by_mean[axis] = pose.R[axis] * x + pose.R[3 + axis] * y + pose.R[6 + axis] * z;
 }
 
 // Takes a step of one Gaussian: Adam with Nesterov's momentum. Widens the bounds, which are in the order of the
@@ -549,9 +562,51 @@ static inline void adam_step(std::size_t id, Lanes gradient, Lanes rate, const M
   gaussians.log_scales[id] = values[3], gaussians.logit_opacities[id] = values[4];
 }
 
-static void update(const Splat* splats, const std::uint32_t* ids, const SplatGradient* gradients, std::size_t begin,
-                   std::size_t end, const Camera& camera, const Pose& pose, const MutableGaussians& gaussians,
-                   const AdamState& adam, const AdamRates& rates, float* bounds) {
+// Calls visit(at, how many, splats, gradients) for splats eight at a time, the last ones padded by zeros.
+template <typename Visit>
+static inline void for_eights(const Splat* splats, const SplatGradient* gradients, std::size_t count,
+                              const Visit& visit) {
+  std::size_t at = 0;
+  for (; at + 8 <= count; at += 8) visit(at, 8, splats + at, gradients + at);
+  if (at == count) return;
+  Splat last_splats[8] = {};
+  SplatGradient last_gradients[8] = {};
+  for (std::size_t i = at; i < count; ++i) last_splats[i - at] = splats[i], last_gradients[i - at] = gradients[i];
+  visit(at, int(count - at), last_splats, last_gradients);
+}
+
+static void project_back(const Splat* splats, const std::uint32_t* ids, const SplatGradient* gradients,
+                         std::size_t count, const Camera& camera, const Pose& pose, const float* means,
+                         const MapGradients& map, double* pose_gradient) {
+  Lanes by_pose[4] = {};  // its columns, one lane per row
+  for_eights(splats, gradients, count, [&](std::size_t at, int some, const Splat* s, const SplatGradient* g) {
+    Lanes in_camera[8], in_world[8];
+    by_gaussians(s, g, camera, in_camera);
+    for (int i = 0; i < 8; ++i) in_world[i] = in_camera[i];
+    turn_to_world(pose, in_world);
+    transpose(in_camera), transpose(in_world);
+    for (int i = 0; i < some; ++i) {
+      const std::size_t id = ids[at + i];
+      for (int axis = 0; axis < 3; ++axis) by_pose[axis] += in_camera[i] * splat(means[3 * id + axis]);
+      by_pose[3] += in_camera[i];
+      float values[8];
+      store(values, in_world[i]);
+      if (map.means) __builtin_memcpy(map.means + 3 * id, values, 3 * sizeof(float));
+      if (map.log_scales) map.log_scales[id] = values[3];
+      if (map.logit_opacities) map.logit_opacities[id] = values[4];
+      if (map.rgb) __builtin_memcpy(map.rgb + 3 * id, values + 5, 3 * sizeof(float));
+    }
+  });
+  for (int column = 0; column < 4; ++column) {
+    float rows[8];
+    store(rows, by_pose[column]);
+    for (int row = 0; row < 3; ++row) pose_gradient[4 * row + column] += rows[row];
+  }
+}
+
+static void update(const Splat* splats, const std::uint32_t* ids, const SplatGradient* gradients, std::size_t count,
+                   const Camera& camera, const Pose& pose, const MutableGaussians& gaussians, const AdamState& adam,
+                   const AdamRates& rates, float* bounds) {
   const float by_value[8] = {rates.means,           rates.means, rates.means, rates.log_scales,
                              rates.logit_opacities, rates.rgb,   rates.rgb,   rates.rgb};
   const Lanes rate = load(by_value);
@@ -559,23 +614,19 @@ static void update(const Splat* splats, const std::uint32_t* ids, const SplatGra
   for (int i = 0; bounds && i < 3; ++i) low[i] = bounds[i], high[i] = bounds[3 + i];
   if (bounds) high[3] = bounds[6];
   Lanes lowest = load(low), highest = load(high);
-  for (std::size_t at = begin; at < end; at += 8) {
-    const int count = end - at < 8 ? int(end - at) : 8;
-    Splat last_splats[8];  // the loads of eight would go beyond the end
-    SplatGradient last_gradients[8];
-    for (int i = 0; count < 8 && i < 8; ++i) {
-      last_splats[i] = i < count ? splats[at + i] : Splat{};
-      last_gradients[i] = i < count ? gradients[at + i] : SplatGradient{};
-    }
+  for_eights(splats, gradients, count, [&](std::size_t at, int some, const Splat* s, const SplatGradient* g) {
     Lanes by_gaussian[8];
-    const unsigned has_any = by_gaussians(count < 8 ? last_splats : splats + at,
-                                          count < 8 ? last_gradients : gradients + at, camera, pose, by_gaussian);
-    for (int i = 0; i < count; ++i)
+    const unsigned has_any = by_gaussians(s, g, camera, by_gaussian);
+    turn_to_world(pose, by_gaussian);
+    transpose(by_gaussian);
+    for (int i = 0; i < some; ++i)
       if (has_any >> i & 1) adam_step(ids[at + i], by_gaussian[i], rate, gaussians, adam, &lowest, &highest);
-  }
+  });
   store(low, lowest), store(high, highest);
   for (int i = 0; bounds && i < 3; ++i) bounds[i] = low[i], bounds[3 + i] = high[i];
   if (bounds) bounds[6] = high[3];
 }
 
-static constexpr Kernels table(const char* name) { return {project, forward, backward, fit, update, align, name}; }
+static constexpr Kernels table(const char* name) {
+  return {project, forward, backward, fit, project_back, update, align, name};
+}

@@ -35,9 +35,10 @@ static inline Lanes sqrt(Lanes x) {
 }
 
 static inline double sum(Lanes x) {
-  double total = 0.0;
-  for (int i = 0; i < 8; ++i) total += x[i];
-  return total;
+  typedef double Doubles __attribute__((vector_size(32)));
+  const Doubles both = __builtin_convertvector(__builtin_shufflevector(x, x, 0, 1, 2, 3), Doubles) +
+                       __builtin_convertvector(__builtin_shufflevector(x, x, 4, 5, 6, 7), Doubles);
+  return (both[0] + both[2]) + (both[1] + both[3]);
 }
 
 // Transposes in place: lane k of rows[i] becomes lane i of rows[k].

@@ -2,8 +2,9 @@
 // task(piece, worker) once for each piece, on up to `threads` threads: the caller, which is worker 0, and the pool's.
 //
 // Pieces are taken from a shared counter, and the caller takes them, too. So a thread that the scheduler has put aside
-// delays nobody, unless it holds a piece: keep pieces short. A second caller finds the pool taken and does its pieces
-// alone. Results must not depend on which thread does a piece, nor on how many there are.
+// delays nobody, unless it holds a piece: keep pieces short. Where that costs more than the pool brings, the caller
+// works alone for a while (Crew). A second caller finds the pool taken and does its pieces alone, too. Results must not
+// depend on which thread does a piece, nor on how many there are.
 #pragma once
 
 #include <algorithm>
@@ -18,6 +19,8 @@
 #include <thread>
 #include <utility>
 #include <vector>
+
+#include "crew.hpp"
 
 namespace splatam {
 
@@ -55,9 +58,17 @@ class ThreadPool {
       for (std::size_t piece = 0; piece < pieces; ++piece) task(piece, 0);
       return;
     }
+    const auto begin = Clock::now();
+    const Nanoseconds before = time_on_core();
+    if (!crew_.has_helpers()) {
+      for (std::size_t piece = 0; piece < pieces; ++piece) task(piece, 0);
+      crew_.note(Clock::now() - begin, time_on_core() - before);
+      return;
+    }
     const Job job{[](const void* of, std::size_t piece, int worker) { (*static_cast<const Task*>(of))(piece, worker); },
                   &task, pieces};
-    share(job, std::min<std::size_t>(threads, pieces));
+    const Nanoseconds mine = share(job, std::min<std::size_t>(threads, pieces)) - before;
+    crew_.note(Clock::now() - begin, mine + Nanoseconds(helped_.exchange(0, std::memory_order_relaxed)));
   }
 
  private:
@@ -81,7 +92,8 @@ class ThreadPool {
   ThreadPool() = default;
   ~ThreadPool() = default;
 
-  void share(const Job& job, std::size_t threads) {
+  // Returns when all pieces are done, and time_on_core() when the caller found none left to take.
+  Nanoseconds share(const Job& job, std::size_t threads) {
     job_ = job;
     failure_ = nullptr;
     failed_.store(false, std::memory_order_relaxed);
@@ -100,12 +112,14 @@ class ThreadPool {
     // Another thread needs about as long for its piece as this one did for each of its own. One that takes longer has
     // been put aside, maybe for this thread, which then does better to sleep: it is woken before those that do not.
     const Ticks usual = (Clock::now() - begin) / Ticks::rep(std::max<std::size_t>(mine, 1));
+    const Nanoseconds on_core = time_on_core();
     const auto is_done = [this] { return unfinished_.load(std::memory_order_acquire) == 0; };
     if (!spin(2 * usual + kShortestWait, is_done)) {
       std::unique_lock<std::mutex> lock(mutex_);
       finished_.wait(lock, is_done);
     }
     if (failure_) std::rethrow_exception(std::exchange(failure_, nullptr));
+    return on_core;
   }
 
   // Takes a piece and does it. Returns false if none is left, or none for this worker. tickets_ holds the number of the
@@ -140,8 +154,10 @@ class ThreadPool {
     const auto is_work = [&] { return is_work_for(self.index); };
     Ticks wait = kLongestWait;
     for (;;) {
-      while (do_piece(self.index)) {
-      }
+      const Nanoseconds before = time_on_core();
+      bool helped = false;
+      while (do_piece(self.index)) helped = true;
+      if (helped) helped_.fetch_add((time_on_core() - before).count(), std::memory_order_relaxed);
       // The stages of a render follow one another faster than a thread can be woken. Where it did not pay to wait for
       // the next one, the wait is shorter the next time.
       if (spin(wait, is_work)) {
@@ -178,6 +194,7 @@ class ThreadPool {
   }
 
   std::mutex turn_;  // held by the caller whose job the pool does
+  Crew crew_;        // under turn_
   std::mutex mutex_;
   std::vector<std::unique_ptr<Worker>> workers_;
   std::condition_variable finished_;
@@ -187,6 +204,7 @@ class ThreadPool {
   std::atomic<int> limit_{0};
   std::atomic<std::uint64_t> tickets_{0};
   std::atomic<std::size_t> unfinished_{0};
+  std::atomic<Nanoseconds::rep> helped_{0};  // for how long threads of the pool have worked on pieces
 };
 
 }  // namespace splatam

@@ -86,8 +86,10 @@ class View:
         camera, rgb8 = self.camera.resized(*size), shrunk(self.rgb8, *size)
         if self.spacing == 1.0:
             return View(camera, rgb8, nearest(self.depth, *size))
-        readings = shrunk_readings(self.depth.numpy(force=True), *size)
-        return View(camera, rgb8, torch.from_numpy(readings).to(self.depth.device), spacing_of_grid(readings > 0))
+        readings = shrunk_readings(np.maximum(self.depth.numpy(force=True), 0), *size)
+        depth = torch.from_numpy(readings).to(self.depth.device)
+        depth = torch.where(depth > 0, depth, nearest(self.depth, *size).clamp(max=0))
+        return View(camera, rgb8, depth, spacing_of_grid(readings > 0))
 
     def narrowed(self, scale: float, max_width: int) -> View:
         """Returns the view resized by ``narrowing``."""

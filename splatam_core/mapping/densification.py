@@ -40,9 +40,22 @@ MAX_ALONE = 0.001
 
 
 def densify(
-    gaussian_map: GaussianMap, view: View, T_cam_world: Tensor, rasterizer: Rasterizer, config: DensificationConfig
+    gaussian_map: GaussianMap,
+    view: View,
+    T_cam_world: Tensor,
+    rasterizer: Rasterizer,
+    config: DensificationConfig,
+    before: Render | None = None,
 ) -> Tensor:
     """Removes the Gaussians that the view sees through, and adds those that make the map explain it.
+
+    Args:
+        gaussian_map: changed in place.
+        view: at full size.
+        T_cam_world: [4, 4] where it was taken from.
+        rasterizer: renders the map.
+        config: where Gaussians are added.
+        before: the map as it is, rendered from there at the size at which they are added, if that exists already.
 
     Returns:
         [K, 3] where the Gaussians were that were removed.
@@ -54,7 +67,7 @@ def densify(
         return rasterizer.render(gaussian_map.gaussians.detached(), view.camera, T_cam_world)
 
     with torch.no_grad():
-        before = render()
+        before = before or render()
         through = seen_through(before, view) if config.depth_noise_ratio > 0 else None  # the paper removes nothing
         if through is not None:
             means = gaussian_map.means.detach()

@@ -205,24 +205,27 @@ def overlaps(points: Tensor, camera: PinholeCamera, keyframes: Sequence[PosedVie
     """Returns, for each keyframe, the fraction of world points [K, 3] that it sees at least ``margin`` pixels inside its image."""
     if not len(points) or not keyframes:
         return [0.0] * len(keyframes)
-    T = torch.stack([keyframe.T_cam_world for keyframe in keyframes])[:, :3]  # [N, 3, 4]
-    shares = torch.zeros(len(T))
-    near = _may_see(points, camera, T).nonzero()[:, 0]  # on a long path only a few
-    homogeneous = torch.cat([points.T, points.new_ones(1, len(points))])  # [4, K]
-    for chosen in near.split(_BATCH):
-        seen = (T[chosen].reshape(-1, 4) @ homogeneous).view(len(chosen), 3, len(points))  # one matrix product; maybe of none
-        x, y, z = seen.unbind(1)  # [N, K] each
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        inside = (u > margin) & (u < camera.width - margin) & (v > margin) & (v < camera.height - margin) & (z > 0)
-        shares[chosen] = inside.float().mean(dim=1)
-    return shares.tolist()
+    T = torch.stack([keyframe.T_cam_world for keyframe in keyframes]).numpy()[:, :3]  # [N, 3, 4]
+    shares = np.zeros(len(T))
+    homogeneous = np.concatenate([points.numpy().T, np.ones((1, len(points)), np.float32)])  # [4, K]
+    near = np.flatnonzero(_may_see(homogeneous, camera, T))  # on a long path only a few
+    for first in range(0, len(near), _BATCH):
+        chosen = near[first : first + _BATCH]
+        x, y, z = (T[chosen].reshape(-1, 4) @ homogeneous).reshape(-1, 3, len(points)).swapaxes(0, 1)  # [N, K] each
+        in_front = z > 0
+        inverse_z = 1 / np.where(in_front, z, np.float32(1))
+        u, v = camera.fx * x * inverse_z + camera.cx, camera.fy * y * inverse_z + camera.cy
+        inside = (u > margin) & (u < camera.width - margin) & (v > margin) & (v < camera.height - margin) & in_front
+        shares[chosen] = inside.mean(axis=1)
+    result: list[float] = shares.tolist()
+    return result
 
 
-def _may_see(points: Tensor, camera: PinholeCamera, T_cam_world: Tensor) -> Tensor:
-    """Returns [N] False where a sphere around the points is behind the camera at [N, 3, 4], or outside its image."""
-    centre = points.mean(dim=0)
-    radius = 1.001 * float((points - centre).norm(dim=1).max()) + 1e-3  # a margin for rounding
-    x, y, z = (T_cam_world[:, :, :3] @ centre + T_cam_world[:, :, 3]).unbind(1)
+def _may_see(points: NDArray[np.float32], camera: PinholeCamera, T_cam_world: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Returns [N] False where a sphere around points [4, K] is behind the camera at [N, 3, 4], or outside its image."""
+    centre = points.mean(axis=1)
+    radius = 1.001 * math.sqrt(np.square(points - centre[:, None]).sum(axis=0).max()) + 1e-3  # a margin for rounding
+    x, y, z = (T_cam_world @ centre).T
     seen = z > -radius
     for across, focal, pixels in (
         (x, camera.fx, camera.cx), (-x, camera.fx, camera.width - camera.cx),

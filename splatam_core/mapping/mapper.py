@@ -86,6 +86,7 @@ class Mapper:
         with torch.no_grad():
             render = self._rasterizer.render(self.map.gaussians.detached(), posed.view.camera, posed.T_cam_world)
             moving = moved_in(render, posed, before)
+        frame = replace(frame, before=render)
         if moving is None:
             return frame
         _log.info('frame %d: something moves in %.0f %% of the view', frame.index, 100 * moving.float().mean())
@@ -103,7 +104,7 @@ class Mapper:
         if plan.densifies:
             self.map.frame = frame.index
             view, T_cam_world = frame.device.view, frame.device.T_cam_world
-            gone = densify(self.map, view, T_cam_world, self._rasterizer, self._config.densification)
+            gone = densify(self.map, view, T_cam_world, self._rasterizer, self._config.densification, frame.before)
             if len(gone):
                 _log.info('frame %d sees through %d Gaussians: what they showed has gone', frame.index, len(gone))
                 self.keyframes.forget(gone)
@@ -187,10 +188,14 @@ class Mapper:
             ValueError: the arrays are not those of such a map.
         """
         self.map.restore(arrays)
-        for keyframe in keyframes:
-            self.keyframes.append(keyframe)
+        self.adopt(keyframes)
         self.rng.bit_generator.state = rng
         self.scene_radius = scene_radius
+
+    def adopt(self, keyframes: Iterable[PosedView]) -> None:
+        """Keeps the keyframes of another mapper."""
+        for keyframe in keyframes:
+            self.keyframes.append(keyframe.comparable() if self._config.mapping.optimizer == 'fused' else keyframe)
 
     def _measure_scene(self, view: View) -> None:
         """Sets the scene radius from the first frame; a later frame that sees so far that new Gaussians are too wide raises it."""

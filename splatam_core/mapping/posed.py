@@ -14,6 +14,8 @@ from splatam_core.config import MappingConfig
 from splatam_core.device import pose_tensor
 from splatam_core.images.observation import Observation
 from splatam_core.images.view import View
+from splatam_core.rasterizer import Render
+from splatam_core.rasterizer.base import NOT_COMPARED
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,6 +47,12 @@ class PosedView:
         """Returns the same at half the size."""
         return PosedView(self.view.scaled(0.5), self.T_cam_world, self.frame)
 
+    def comparable(self) -> PosedView:
+        """Returns the same, in which nothing is compared far from every reading."""
+        view = self.view
+        depth = torch.where(view.near_readings(), view.depth, NOT_COMPARED)
+        return replace(self, view=replace(view, depth=depth))
+
     def bare(self) -> PosedView:
         """Returns the same without cached images: seven bytes a pixel."""
         return PosedView(replace(self.view), self.T_cam_world, self.frame)
@@ -59,12 +67,14 @@ class PosedFrame:
         T_cam_world: [4, 4] float64.
         config: says at which size views are fitted.
         index: number of the frame.
+        before: the map as the frame found it, at the size at which Gaussians are added; None where it was not rendered.
     """
 
     observation: Observation
     T_cam_world: NDArray[np.float64]
     config: MappingConfig
     index: int = -1
+    before: Render | None = None
 
     @cached_property
     def host(self) -> PosedView:
@@ -78,9 +88,10 @@ class PosedFrame:
 
     @cached_property
     def keyframe(self) -> PosedView:
-        """At the size at which views are fitted, in the host's memory: what is kept."""
+        """At the size at which views are fitted, and with what the optimizer compares, in the host's memory: what is kept."""
         view = self.observation.host.narrowed(self.config.scale, self.config.max_width)
-        return PosedView.at(view, self.T_cam_world, self.index)
+        posed = PosedView.at(view, self.T_cam_world, self.index)
+        return posed.comparable() if self.config.optimizer == 'fused' else posed
 
     @cached_property
     def to_fit(self) -> PosedView:

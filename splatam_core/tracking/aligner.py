@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,11 +153,26 @@ class Aligner(Protocol[ImageT]):
         to the next.
         """
 
-    def fill_holes(self, depth: ImageT, max_gap: int, max_step: float) -> ImageT:
-        """Returns depth [H, W] with holes of at most ``max_gap`` pixels closed, along rows and then along columns.
+    def frame_images(self, rgb8: Any, depth: ImageT, max_gap: int, max_step: float) -> tuple[ImageT, ImageT]:
+        """Returns brightness and depth of a frame, with holes of the depth closed along rows and then along columns.
 
-        A hole is closed where the depths on both sides differ by at most the fraction ``max_step`` of the nearer one.
-        Inverse depth is interpolated, which is exact on a plane.
+        A hole of at most ``max_gap`` pixels is closed where the depths on both sides differ by at most the fraction
+        ``max_step`` of the nearer one. Inverse depth is interpolated, which is exact on a plane.
+
+        Args:
+            rgb8: [H, W, 3] uint8.
+            depth: [H, W] metres; no number above 0 is no reading.
+            max_gap: pixels.
+            max_step: a fraction.
+        """
+
+    def render_images(
+        self, rgb: ImageT, depth_acc: ImageT, silhouette: ImageT, threshold: float, least: float
+    ) -> tuple[ImageT, ImageT]:
+        """Returns brightness and depth of a ``Render``, without the black that shows where the silhouette dips.
+
+        Depth is NaN where the silhouette is not above ``threshold``, or ``Render.depth`` is 0. To divide by, the silhouette
+        counts as at least ``threshold`` and ``least``.
         """
 
     def halve(self, brightness: ImageT, depth: ImageT, max_step: float) -> tuple[ImageT, ImageT]:

@@ -140,7 +140,7 @@ class AlignmentTracker:
         if renders_half:
             camera = finest
         render = self._render(frame.gaussians, camera, T_cam_world)
-        level = render_level(render, camera, self._config.silhouette_threshold)
+        level = render_level(render, camera, self._config.silhouette_threshold, self._aligner)
         return full_pyramid(level, self._aligner) if renders_half else half_pyramid(level, self._aligner)
 
     def _pose_by_features(self, frame: _Frame, T_cam_world: Matrix) -> Matrix | None:

@@ -22,7 +22,8 @@ from splatam_core.tracking.readout import ReadoutSeen
 from splatam_core.tracking.time_offset import TimeOffset
 
 _MIN_POINTS = 50
-_SMALL_STEP = 1e-5  # m, rad: converged
+_SMALL_STEP = 1e-4  # m, rad: converged; a step is a fraction of the one before
+_SMALL_COARSE_STEP = 1e-3  # at a level from which a finer one goes on
 _FIRST_SCALES = 0.1, 0.02  # of residuals: brightness in [0, 1], relative depth
 _MIN_SCALES = 0.004, 0.001  # no sensor is better
 _MAD_TO_DEVIATION = 1.4826  # standard deviation over median absolute deviation, for a normal distribution
@@ -173,7 +174,8 @@ class GaussNewton:
                 pace=pace,
                 readout=readout,
             )
-            state, scales = self._iterate(pair, state, scales)
+            small_step = _SMALL_STEP if reference is references[0] else _SMALL_COARSE_STEP
+            state, scales = self._iterate(pair, state, scales, small_step)
         system = self._linearize(pair, state, scales)
         after, equations, free = time_offset, _Equations.of(system, state, pair), self._unknowns(pair)
         if self._estimates_time_offset:
@@ -184,9 +186,9 @@ class GaussNewton:
         return Alignment(state, system, after, partial(self._weigh, pair, state, scales), _seen(equations, state, pair, free))
 
     def _iterate(
-        self, pair: _Pair, state: AlignmentState, scales: tuple[float, float]
+        self, pair: _Pair, state: AlignmentState, scales: tuple[float, float], small_step: float
     ) -> tuple[AlignmentState, tuple[float, float]]:
-        """Takes steps at one level until they are small. Returns the state and the scales of the residuals."""
+        """Takes steps at one level until one is small, m and rad. Returns the state and the scales of the residuals."""
         for _ in range(self._config.iterations):
             if pair.predicted_motion is not None:
                 state = replace(state, velocity=pair.pace.twist(state.depth_motion @ pair.predicted_motion))
@@ -196,7 +198,7 @@ class GaussNewton:
             if step is None:
                 break
             state = state.moved(step)
-            if np.abs(step[:6]).max() < _SMALL_STEP:
+            if np.abs(step[:6]).max() < small_step:
                 break
         return state, scales
 

@@ -6,13 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
-import torch
 from torch import Tensor
 
 from splatam_core.geometry.camera import PinholeCamera
-from splatam_core.images.filters import brightness, is_on_host, luminance
+from splatam_core.images.filters import is_on_host
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Render
 from splatam_core.tracking.aligner import Aligner, Array
@@ -51,30 +49,17 @@ def frame_level(view: View, aligner: Aligner[Any]) -> Level:
     Halving drops every block with a hole, and colour is compared only at points of known depth.
     """
     max_gap, share = max(1, round(_MAX_HOLE * view.camera.width)), view.spacing**-_SHARE_POWER
-    if not is_on_host(view.depth):
-        readings = torch.where(view.valid, view.depth, torch.nan)
-        return Level(view.camera, brightness(view.rgb8), aligner.fill_holes(readings, max_gap, EDGE), share)
-    depth = np.where(view.valid, view.depth, np.float32(np.nan))
-    light = _brightness(view.rgb8.numpy().astype(np.float32) / np.float32(255))
-    return Level(view.camera, light, aligner.fill_holes(depth, max_gap, EDGE), share)
+    brightness, depth = aligner.frame_images(_for_aligner(view.rgb8), _for_aligner(view.depth), max_gap, EDGE)
+    return Level(view.camera, brightness, depth, share)
 
 
-def render_level(render: Render, camera: PinholeCamera, silhouette_threshold: float) -> Level:
+def render_level(render: Render, camera: PinholeCamera, silhouette_threshold: float, aligner: Aligner[Any]) -> Level:
     """Returns a render at its full resolution, with depth where the silhouette is above the threshold.
 
     Where Gaussians of two frames meet, the silhouette dips and the black behind them shows. The brightness is that without it.
     """
-    least = max(silhouette_threshold, _LEAST_SILHOUETTE)
-    if not is_on_host(render.rgb):
-        visible, rgb = render.silhouette > silhouette_threshold, (render.rgb / render.silhouette.clamp(min=least)).permute(1, 2, 0)
-        return Level(camera, luminance(rgb), torch.where(visible, render.depth(), torch.nan))
-    silhouette, (red, green, blue) = render.silhouette.numpy(), render.rgb.numpy()
-    light = np.float32(0.299) * red
-    light += np.float32(0.587) * green
-    light += np.float32(0.114) * blue
-    light /= np.maximum(silhouette, np.float32(least))
-    depth = np.where(silhouette > silhouette_threshold, render.depth().numpy(), np.float32(np.nan))
-    return Level(camera, light, depth)
+    rgb, depth_acc, silhouette = map(_for_aligner, (render.rgb, render.depth_acc, render.silhouette))
+    return Level(camera, *aligner.render_images(rgb, depth_acc, silhouette, silhouette_threshold, _LEAST_SILHOUETTE))
 
 
 def half_pyramid(level: Level, aligner: Aligner[Any]) -> list[Level]:
@@ -103,6 +88,6 @@ def _halved(level: Level, aligner: Aligner[Any]) -> Iterator[Level]:
         yield level
 
 
-def _brightness(rgb: Array) -> Array:
-    """Returns [H, W] luminance of colours [H, W, 3]."""
-    return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32, copy=False)
+def _for_aligner(image: Tensor) -> Any:
+    """Returns an image on the host as an array, which the native aligner takes; another one as it is."""
+    return image.numpy() if is_on_host(image) else image

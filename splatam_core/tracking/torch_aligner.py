@@ -14,6 +14,8 @@ from torch import Tensor
 
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.se3 import Matrix
+from splatam_core.images.filters import brightness, luminance
+from splatam_core.rasterizer import Render
 from splatam_core.tracking.aligner import EvidenceSums, Linearization
 from splatam_core.tracking.evidence import summed
 
@@ -55,10 +57,18 @@ class TorchAligner:
         result[..., 3] = torch.where(is_surface, depth, torch.nan)
         return result
 
-    def fill_holes(self, depth: Tensor, max_gap: int, max_step: float) -> Tensor:
-        """See ``Aligner.fill_holes``."""
-        along_rows = _filled_rows(depth, max_gap, max_step)
-        return _filled_rows(along_rows.T, max_gap, max_step).T.contiguous()
+    def frame_images(self, rgb8: Tensor, depth: Tensor, max_gap: int, max_step: float) -> tuple[Tensor, Tensor]:
+        """See ``Aligner.frame_images``."""
+        along_rows = _filled_rows(torch.where(depth > 0, depth, torch.nan), max_gap, max_step)
+        return brightness(rgb8), _filled_rows(along_rows.T, max_gap, max_step).T.contiguous()
+
+    def render_images(
+        self, rgb: Tensor, depth_acc: Tensor, silhouette: Tensor, threshold: float, least: float
+    ) -> tuple[Tensor, Tensor]:
+        """See ``Aligner.render_images``."""
+        light = luminance(rgb.permute(1, 2, 0)) / silhouette.clamp(min=max(threshold, least))
+        depth = Render(rgb, depth_acc, silhouette).depth()
+        return light, torch.where((silhouette > threshold) & (depth > 0), depth, torch.nan)
 
     def halve(self, brightness: Tensor, depth: Tensor, max_step: float) -> tuple[Tensor, Tensor]:
         """See ``Aligner.halve``."""

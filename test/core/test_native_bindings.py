@@ -89,6 +89,16 @@ def halve(**changed: object) -> None:
     _native.Aligner(1).layers(**(arguments | changed))
 
 
+def frame_images(**changed: object) -> None:
+    arguments = {'rgb8': np.zeros((HEIGHT, WIDTH, 3), np.uint8), 'depth': floats(HEIGHT, WIDTH), 'max_gap': 2, 'max_step': 0.1}
+    _native.Aligner(1).frame_images(**(arguments | changed))
+
+
+def render_images(**changed: object) -> None:
+    planes = {'rgb': floats(3, HEIGHT, WIDTH), 'depth_acc': floats(HEIGHT, WIDTH), 'silhouette': floats(HEIGHT, WIDTH)}
+    _native.Aligner(1).render_images(**(planes | {'threshold': 0.5, 'least': 0.1} | changed))
+
+
 def blend(**changed: object) -> None:
     arguments = {'shapes': floats(N, 6), 'features': floats(N, 4), 'image': floats(5, HEIGHT, WIDTH)}
     _native.Blender(1).forward(**(arguments | changed))
@@ -115,6 +125,8 @@ CALLS = {
     linearize: {'brightness': PLANE, 'depth': PLANE, 'layers': (HEIGHT, WIDTH, 8), 'velocity': (6,), 'readout': (6,)},
     evidence: {'brightness': PLANE, 'depth': PLANE, 'layers': (HEIGHT, WIDTH, 8), 'velocity': (6,), 'readout': (6,)},
     halve: {'brightness': PLANE, 'depth': PLANE},
+    frame_images: {'depth': PLANE},
+    render_images: {'rgb': IMAGE, 'depth_acc': PLANE, 'silhouette': PLANE},
     blend: {'shapes': (N, 6), 'features': (N, 4), 'image': (5, HEIGHT, WIDTH)},
     blend_back: {
         'shapes': (N, 6), 'features': (N, 4), 'image': (5, HEIGHT, WIDTH), 'image_gradient': (5, HEIGHT, WIDTH),
@@ -147,7 +159,7 @@ def test_every_array_is_checked_by_name(call: object, name: str, shape: tuple[in
             call(**{name: value})
         text = str(caught.value)
         assert 'expected' in text or 'incompatible function arguments' in text
-    sized = {'means', 'depth', 'target_depth', 'brightness', 'shapes'}  # others are compared with these
+    sized = {'means', 'depth', 'depth_acc', 'target_depth', 'brightness', 'shapes'}  # others are compared with these
     if name not in sized and call is not blend:
         with pytest.raises(TypeError, match=name.partition('_at_')[0]):
             call(**{name: floats(*shape[:-1], shape[-1] + 1)})

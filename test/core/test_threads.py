@@ -81,7 +81,9 @@ def aligned(threads: int) -> Arrays:
     numbers += [system.photometric_median, system.depth_median]
     return [
         system.H, system.g, system.H_by_time, system.H_by_time_squared, system.g_by_time, np.array(numbers), layers,
-        *aligner.halve(brightness, depth, 0.05), aligner.fill_holes(depth, 4, 0.05),
+        *aligner.halve(brightness, depth, 0.05),
+        *aligner.frame_images(rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8), depth, 4, 0.05),
+        *aligner.render_images(rng.random((3, HEIGHT, WIDTH), dtype=np.float32), depth, brightness, 0.3, 1e-3),
     ]  # fmt: skip
 
 

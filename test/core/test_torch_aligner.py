@@ -84,6 +84,25 @@ def test_layers_and_halving_are_the_native_ones(size: tuple[int, int]) -> None:
             assert np.allclose(half.numpy(), expected_half, rtol=1e-6, equal_nan=True)
 
 
+@pytest.mark.parametrize('threshold', [0.3, 0.9])
+def test_images_of_frames_and_renders_are_the_native_ones(threshold: float) -> None:
+    """Frames with holes that are zero or negative; renders whose silhouette is 0, below a half, and above the threshold."""
+    rng, native, ours = np.random.default_rng(5), make_native_aligner(2), TorchAligner()
+    rgb8 = rng.integers(0, 256, (35, 41, 3), np.uint8)
+    depth = _picture(6, (35, 41))[1]
+    depth[rng.random(depth.shape) < 0.2] = 0
+    depth[10] = -1
+    silhouette = rng.random((35, 41), dtype=np.float32)
+    silhouette[3] = 0
+    drawn = rng.random((3, 35, 41), dtype=np.float32), np.float32(2) * silhouette, silhouette
+    for of_torch, expected in (
+        (ours.frame_images(*_tensors(rgb8, depth), 3, EDGE), native.frame_images(rgb8, depth, 3, EDGE)),
+        (ours.render_images(*_tensors(*drawn), threshold, 1e-3), native.render_images(*drawn, threshold, 1e-3)),
+    ):
+        for image, expected_image in zip(of_torch, expected, strict=True):
+            assert np.allclose(image.numpy(), expected_image, rtol=1e-5, equal_nan=True)  # roundings of a sum of three
+
+
 @pytest.mark.parametrize('threads', [1, 3])
 def test_holes_are_closed_between_readings_of_one_surface(threads: int) -> None:
     """Exactly on a tilted plane; not across a step, a wide hole or the border; by either aligner."""
@@ -93,14 +112,19 @@ def test_holes_are_closed_between_readings_of_one_surface(threads: int) -> None:
     depth = plane.copy()
     depth[5, 3:6] = depth[8:10, 10] = depth[12, 24:27] = depth[15, 5:17] = depth[20, :2] = np.nan
     depth[14:17, 4:18] = np.nan  # wider than four pixels, but only three high
-    native = make_native_aligner(threads).fill_holes(depth, 4, EDGE)
-    assert np.allclose(TorchAligner().fill_holes(torch.from_numpy(depth), 4, EDGE).numpy(), native, rtol=1e-6, equal_nan=True)
+
+    def filled(depth: Image) -> Image:
+        return make_native_aligner(threads).frame_images(np.zeros((*depth.shape, 3), np.uint8), depth, 4, EDGE)[1]
+
+    native = filled(depth)
+    by_torch = TorchAligner().frame_images(torch.zeros(24, 40, 3, dtype=torch.uint8), torch.from_numpy(depth), 4, EDGE)[1]
+    assert np.allclose(by_torch.numpy(), native, rtol=1e-6, equal_nan=True)
     closed = ~np.isnan(native)
     assert np.allclose(native[closed], plane[closed], rtol=1e-5)
     assert closed[5, 3:6].all() and closed[8:10, 10].all() and closed[14:17, 4:18].all()
     assert closed[12, 24:27].all(), 'the column bridges what the row must not'
-    assert np.isnan(make_native_aligner(threads).fill_holes(depth[12:13], 4, EDGE)[0, 24:27]).all()
-    assert np.isnan(make_native_aligner(threads).fill_holes(depth[20:21], 4, EDGE)[0, :2]).all()
+    assert np.isnan(filled(depth[12:13])[0, 24:27]).all()
+    assert np.isnan(filled(depth[20:21])[0, :2]).all()
 
 
 def test_colour_is_compared_where_the_frame_has_no_depth() -> None:
@@ -224,8 +248,12 @@ class _Bridge:
     def layers(self, brightness: Image, depth: Image, max_step: float) -> Image:
         return self._aligner.layers(*_tensors(brightness, depth), max_step).numpy()
 
-    def fill_holes(self, depth: Image, max_gap: int, max_step: float) -> Image:
-        return self._aligner.fill_holes(*_tensors(depth), max_gap, max_step).numpy()
+    def frame_images(self, rgb8: Image, depth: Image, max_gap: int, max_step: float) -> tuple[Image, ...]:
+        return tuple(image.numpy() for image in self._aligner.frame_images(*_tensors(rgb8, depth), max_gap, max_step))
+
+    def render_images(self, rgb: Image, depth_acc: Image, silhouette: Image, threshold: float, least: float) -> tuple[Image, ...]:
+        drawn = _tensors(rgb, depth_acc, silhouette)
+        return tuple(image.numpy() for image in self._aligner.render_images(*drawn, threshold, least))
 
     def halve(self, brightness: Image, depth: Image, max_step: float) -> tuple[Image, ...]:
         return tuple(image.numpy() for image in self._aligner.halve(*_tensors(brightness, depth), max_step))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,15 +17,19 @@ from thinned_depth import ThinnedSequence, thinned
 from splatam_core.config import DensificationConfig, load_config
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.datasets.synthetic import SyntheticSequence
+from splatam_core.device import HOST
 from splatam_core.evaluation.trajectory import trajectory_error
 from splatam_core.geometry.camera import CameraCalibration, PinholeCamera
 from splatam_core.geometry.trajectory import Trajectory
+from splatam_core.images.observation import Observation
 from splatam_core.images.rectification import FrameFactory
 from splatam_core.images.spacing import REGISTER_ADVICE, reading_spacing, shrunk_readings
 from splatam_core.images.view import View
 from splatam_core.mapping.densification import densify, new_widths
 from splatam_core.mapping.gaussian_map import GaussianMap
+from splatam_core.mapping.posed import PosedFrame
 from splatam_core.rasterizer import make_rasterizer
+from splatam_core.rasterizer.base import NOT_COMPARED
 from splatam_core.runs.checkpoints import Checkpoints, Progress, read_checkpoint
 from splatam_core.slam import Slam
 from splatam_core.tracking.alignment import make_aligner
@@ -239,6 +244,25 @@ def assert_the_edge_of_a_roof_does_not_grow_into_the_sky(street: FarStereo, slam
         rendered = slam.render(results[index].T_world_cam)
         assert far_from_surfaces.sum() > 5000
         assert (rendered.silhouette[far_from_surfaces] > 0.5).mean() < 0.05
+
+
+@pytest.mark.parametrize('optimizer', ['fused', 'paper'])
+@pytest.mark.parametrize('spacing', [1, 2])
+def test_keyframes_hold_what_is_compared(spacing: int, optimizer: str) -> None:
+    """Nothing is far from every reading, at half size and among the readings of a grid as well; twice is as once."""
+    depth = np.zeros((240, 320), np.float32)
+    depth[::spacing, :160:spacing] = 2.0
+    frame = RgbdFrame(0, np.full((240, 320, 3), 90, np.uint8), depth, CAMERA)
+    config = load_config('realtime')
+    mapping = replace(config.mapping, optimizer=optimizer)
+    seen = Observation.from_frame(frame, config.depth, HOST)
+    keyframe = PosedFrame(seen, np.eye(4), mapping).keyframe
+    for posed in (keyframe, keyframe.half_size()):
+        near, far = posed.view.depth.chunk(2, dim=1)
+        assert bool((near >= 0).all()) and bool((far[:, 20:] == NOT_COMPARED).all()) == (optimizer == 'fused')
+        assert near.max() == posed.view.depth.max() == 2.0
+    if optimizer == 'fused':
+        assert torch.equal(keyframe.comparable().view.depth, keyframe.view.depth)
 
 
 def test_speckles_add_nothing_and_thin_things_stay() -> None:

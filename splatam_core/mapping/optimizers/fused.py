@@ -7,17 +7,12 @@ import time
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
 from splatam_core.config import MappingConfig
-from splatam_core.images.view import View
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.optimizers.base import TimeLimit, prune, rates
 from splatam_core.mapping.posed import PosedView
 from splatam_core.rasterizer import Rasterizer, Rates, Target
-from splatam_core.rasterizer.base import NOT_COMPARED
 
 FINAL_FIRST, FINAL_LAST = 5.0, 0.1
 """Step sizes at the beginning and at the end of ``finish``, relative to those of ``fit``; half a cosine lies between them."""
@@ -29,7 +24,8 @@ FINAL_MEANS, FINAL_SCALES, FINAL_COLORS = 0.1, 3.0, 2.0
 class FusedOptimizer:
     """Huber loss without SSIM; moments live as long as their Gaussians; only visible Gaussians move.
 
-    Colour far from every reading is not compared: Gaussians at the edge of a roof would grow into the sky to explain it.
+    Colour far from every reading is not compared (``PosedView.comparable``): Gaussians at the edge of a roof would grow into the
+    sky to explain it.
     """
 
     def __init__(self, rasterizer: Rasterizer, config: MappingConfig) -> None:
@@ -38,13 +34,12 @@ class FusedOptimizer:
     def fit(self, gaussian_map: GaussianMap, views: Iterable[PosedView], scene_radius: float) -> None:
         """See ``MapOptimizer.fit``."""
         for posed in views:
-            self._step(gaussian_map, posed, posed.view.near_readings(), rates(self._config))
+            self._step(gaussian_map, posed, rates(self._config))
         prune(gaussian_map, self._config, scene_radius, self._config.fused.prune_fraction)
 
     def finish(self, gaussian_map: GaussianMap, keyframes: Sequence[PosedView], rng: np.random.Generator, limit: TimeLimit) -> int:
         """See ``MapOptimizer.finish``. Decreasing step sizes bring back what few steps a frame had forgotten."""
         num_steps, began_s = self._config.fused.final_passes * len(keyframes), time.monotonic()
-        masks = _Masks()
         for step in range(num_steps):
             if step % len(keyframes) == 0:
                 order = rng.permutation(len(keyframes))
@@ -53,30 +48,13 @@ class FusedOptimizer:
                 done = time_used
             if done >= 1 or limit.stop():
                 return step
-            chosen = int(order[step % len(keyframes)])
-            posed = keyframes[chosen]
-            self._step(gaussian_map, posed, masks.near_readings(chosen, posed.view), _final_rates(self._config, done))
+            self._step(gaussian_map, keyframes[int(order[step % len(keyframes)])], _final_rates(self._config, done))
         return num_steps
 
-    def _step(self, gaussian_map: GaussianMap, posed: PosedView, is_compared: Tensor, rates: Rates) -> None:
+    def _step(self, gaussian_map: GaussianMap, posed: PosedView, rates: Rates) -> None:
         view, config = posed.view, self._config
-        depth = torch.where(is_compared, view.depth, NOT_COMPARED)
-        target = Target(view.camera, view.rgb8, depth, posed.T_cam_world, config.color_weight, config.depth_weight)
+        target = Target(view.camera, view.rgb8, view.depth, posed.T_cam_world, config.color_weight, config.depth_weight)
         self._rasterizer.fit(gaussian_map.gaussians, gaussian_map.moments, rates, target)
-
-
-class _Masks:
-    """Which pixels of each keyframe are near readings: found in the first pass, kept as a bit a pixel for the others."""
-
-    def __init__(self) -> None:
-        self._packed: dict[int, NDArray[np.uint8]] = {}
-
-    def near_readings(self, index: int, view: View) -> Tensor:
-        """Returns ``view.near_readings()`` of the keyframe with this index."""
-        if index not in self._packed:
-            self._packed[index] = np.packbits(view.near_readings().numpy(force=True))
-        bits = np.unpackbits(self._packed[index], count=view.depth.numel()).view(np.bool_)
-        return torch.from_numpy(bits.reshape(view.depth.shape)).to(view.depth.device)
 
 
 def _final_rates(config: MappingConfig, done: float) -> Rates:

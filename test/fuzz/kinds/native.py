@@ -214,16 +214,20 @@ def pyramid(values: Values, tally: Tally) -> None:
     tally.attempt(partial(aligner.layers, **arguments), *REFUSED)
 
 
-def fill_holes(values: Values, tally: Tally) -> None:
+def levels(values: Values, tally: Tally) -> None:
     aligner = _native.Aligner(values.call.threads)
+    drawn = {'rgb': values.image(3), 'depth_acc': values.image(high=4.0), 'silhouette': values.image()}
+    limits = {'threshold': values.scalar(0.5), 'least': values.scalar(0.1)}
+    tally.attempt(partial(aligner.render_images, **values.spoilt(drawn | limits)), *REFUSED)
     depth = values.image(high=4.0)
     depth[values.rng.random(depth.shape) < 0.5] = 0
     gap = int(values.rng.choice([0, 1, 3, 100, -1, 2**31 - 1, -(2**31)]))
-    arguments = values.spoilt({'depth': depth, 'max_gap': gap, 'max_step': values.scalar(0.1)})
-    filled = tally.attempt(partial(aligner.fill_holes, **arguments), *REFUSED)
-    assert filled is None or filled.shape == arguments['depth'].shape
+    rgb8 = values.rng.integers(0, 256, (*depth.shape, 3), np.uint8)
+    arguments = values.spoilt({'rgb8': rgb8, 'depth': depth, 'max_gap': gap, 'max_step': values.scalar(0.1)})
+    images = tally.attempt(partial(aligner.frame_images, **arguments), *REFUSED)
+    assert images is None or images[1].shape == arguments['depth'].shape
     if is_sound(values):
-        assert np.isfinite(filled).all() and np.array_equal(filled[depth > 0], depth[depth > 0])
+        assert np.isfinite(images[0]).all() and np.array_equal(images[1][depth > 0], depth[depth > 0])
 
 
 def shapes(values: Values) -> np.ndarray:
@@ -253,7 +257,7 @@ def blend(values: Values, tally: Tally) -> None:
 
 
 NATIVE_CALLS: dict[str, Callable[[Values, Tally], None]] = {
-    'forward': forward, 'backward': backward, 'fit': fit, 'linearize': linearize, 'pyramid': pyramid, 'fill_holes': fill_holes,
+    'forward': forward, 'backward': backward, 'fit': fit, 'linearize': linearize, 'pyramid': pyramid, 'levels': levels,
     'blend': blend,
 }  # fmt: skip
 
