@@ -48,10 +48,10 @@ class PosedView:
         return PosedView(self.view.scaled(0.5), self.T_cam_world, self.frame)
 
     def comparable(self) -> PosedView:
-        """Returns the same, in which nothing is compared far from every reading."""
+        """Returns the same, in which nothing is compared far from every reading; itself where that is so already."""
         view = self.view
         depth = torch.where(view.near_readings(), view.depth, NOT_COMPARED)
-        return replace(self, view=replace(view, depth=depth))
+        return self if torch.equal(depth, view.depth) else replace(self, view=replace(view, depth=depth))
 
     def bare(self) -> PosedView:
         """Returns the same without cached images: seven bytes a pixel."""
