@@ -7,7 +7,6 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
-from itertools import accumulate, groupby
 from pathlib import Path
 
 import pytest
@@ -42,18 +41,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker('ros')
         if 'recording' in fixtures:
             item.add_marker('recording')
-    items[:] = _spread(items)
-
-
-def _spread(items: list[pytest.Item]) -> list[pytest.Item]:
-    """Returns the tests with the modules that start ROS processes evenly among the others: those wait a lot."""
-    modules = [list(module) for _, module in groupby(items, key=lambda item: item.path)]
-    waiting = [module for module in modules if any(item.get_closest_marker('ros') for item in module)]
-    working = [module for module in modules if module not in waiting]
-    ends, total = accumulate(map(len, working)), sum(map(len, working))
-    places = [(end / total, module) for end, module in zip(ends, working, strict=True)]
-    places += [((index + 0.5) / len(waiting), module) for index, module in enumerate(waiting)]
-    return [item for _, module in sorted(places, key=lambda place: place[0]) for item in module]
 
 
 @pytest.hookimpl(hookwrapper=True)
