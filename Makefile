@@ -10,7 +10,7 @@ CSRC := $(wildcard splatam_core/csrc/*)
 FINDABLE = $(foreach name,python3 python3.12 python3.11 python3.10,$(shell $(name) -c '$(CHECK_PYTHON)' 2>/dev/null && echo $(name)))
 CHECK_PYTHON := import sys; sys.exit(0 if (3, 10) <= sys.version_info < (3, 13) else 1)
 PYTHON ?= $(firstword $(FINDABLE))
-TEST_WORKERS ?= 4
+TEST_WORKERS ?= 3
 FUZZ_MINUTES ?= 10
 export SPLATAM_DATA ?= $(abspath ../shared/data)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -20,7 +20,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 help:
 	@echo 'make setup           create $(VENV), build the native code and install the package (PYTHON=python3.11 chooses the interpreter)'
 	echo 'make test-quick      run the fast tests: no ROS processes, no recordings, under 2 minutes'
-	echo 'make test            run every test, $(TEST_WORKERS) at a time (TEST_WORKERS=2 changes that)'
+	echo 'make test            run every test, $(TEST_WORKERS) at a time (TEST_WORKERS=4 changes that)'
 	echo 'make fuzz            try odd and damaged input of every kind for $(FUZZ_MINUTES) minutes (FUZZ_MINUTES=1 changes that)'
 	echo 'make fuzz-long       the same until every kind has had its number of inputs: hours; continues where it stopped'
 	echo 'make sanitize        run tests and fuzz of the native code with the address and undefined-behaviour sanitizers of g++'

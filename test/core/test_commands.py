@@ -235,7 +235,7 @@ def test_refine_makes_a_better_map_and_leaves_the_run_alone(
 def test_refine_may_add_gaussians(run: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr('splatam_core.mapping.offline_refinement.DENSIFY_FROM', 20)
     monkeypatch.setattr('splatam_core.mapping.offline_refinement.DENSIFY_EVERY', 20)
-    steps = ['--iterations', 100]
+    steps = ['--iterations', 60]
     assert splatam('refine', run.path, '--out', tmp_path / 'same', *steps) == 0
     assert splatam('refine', run.path, '--out', tmp_path / 'grown', *steps, '--densify') == 0
     same, grown = (len(read_ply(tmp_path / name / 'map.ply')) for name in ('same', 'grown'))

@@ -71,10 +71,10 @@ TOLERANCE = {'splatam': 1e-4, 'realtime': 5e-4}
 @pytest.mark.parametrize('preset', FEW_STEPS)
 def test_frames_on_the_device_are_those_of_the_host(preset: str, room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
     """No frame touches the host's memory unasked, and from the same state both find the same pose."""
-    sequence, host = room(6, WIDTHS[preset], noise=False), Slam(_config(preset))
+    sequence, host = room(4, WIDTHS[preset], noise=False), Slam(_config(preset))
     with _on_device(monkeypatch):
         there = Slam(_config(preset, 'keyframes.on_device=2'))
-        for index in range(6):
+        for index in range(4):
             host.restore(there.state())
             found, expected = there.process(sequence[index]), host.process(sequence[index])
             assert found.status is expected.status is (Status.TRACKED if index else Status.INITIALIZED)

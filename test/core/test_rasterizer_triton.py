@@ -184,10 +184,10 @@ def test_frames_find_the_poses_of_the_cpu(room: Callable[..., SyntheticSequence]
         'threads=1', 'tracking.iterations=3', 'tracking.paper.translation_rate=0.0005', 'tracking.paper.rotation_rate=0.0001',
         'mapping.iterations=2', 'mapping.first_iterations=2', 'mapping.prune_scale=1.0', 'keyframes.every=3',
     ]  # fmt: skip
-    sequence = room(6, 16, noise=False)
+    sequence = room(5, 16, noise=False)
     there = Slam(load_config('splatam', [*few, 'rasterizer=triton', f'device={DEVICE}']))
     host = Slam(load_config('splatam', [*few, 'rasterizer=cpu', 'device=cpu']))
-    for index in range(6):
+    for index in range(5):
         host.restore(there.state())
         found, expected = there.process(sequence[index]), host.process(sequence[index])
         assert found.status is expected.status is (Status.TRACKED if index else Status.INITIALIZED)

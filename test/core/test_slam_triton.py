@@ -36,9 +36,9 @@ def _config(rasterizer: str) -> SlamConfig:
 @pytest.mark.slow
 def test_frames_of_realtime_are_those_of_the_native_rasterizer(room: Room) -> None:
     """Each starts from the same state, which moves between the two without loss: equal statuses and numbers of Gaussians."""
-    sequence = room(6, WIDTH, noise=False)
+    sequence = room(4, WIDTH, noise=False)
     native, triton = Slam(_config('cpu')), Slam(_config('triton'))
-    for index in range(6):
+    for index in range(4):
         state = triton.state()
         native.restore(state)
         assert all(np.array_equal(values, state.map[name]) for name, values in native.state().map.items())
