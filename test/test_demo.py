@@ -120,10 +120,10 @@ def test_a_node_that_dies_ends_the_demo_with_its_last_words(out: Path) -> None:
     wait_until(lambda: not alive(out))  # the viewer notices by itself that the node is gone
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_every_process(out: Path, number: signal.Signals) -> None:
+@pytest.mark.parametrize(('number', 'step'), [(signal.SIGINT, 'convert'), (signal.SIGTERM, 'splatam_ros.player.main')])
+def test_a_signal_ends_every_process(out: Path, number: signal.Signals, step: str) -> None:
     process = start_demo(out, 'synthetic:frames=12')
-    wait_until(lambda: (out / 'trajectory.txt').is_file())
+    wait_until(lambda: any(step in command for command in alive(out)))
     process.send_signal(number)
     said, _ = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 130, said

@@ -308,7 +308,7 @@ def check_page(text: str) -> Page:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(('with_ground_truth', 'with_images'), [(True, True), (False, True), (True, False), (False, False)])
+@pytest.mark.parametrize(('with_ground_truth', 'with_images'), [(True, True), (False, True), (True, False)])
 def test_page_is_complete_and_needs_nothing_else(tmp_path: Path, with_ground_truth: bool, with_images: bool) -> None:
     sequence = Wall()
     run = make_run(tmp_path / 'a run & <more>', sequence)
