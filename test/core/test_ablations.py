@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from splatam_core.cli import main
+from splatam_core.commands.shared import run_in_own_process
 from splatam_core.config import flat_values
 from splatam_core.errors import RunFolderError
 from splatam_core.evaluation.ablations import FULL, provenance, rows, variant_names, variants
@@ -59,6 +60,12 @@ def test_a_set_is_run_once_and_printed(tmp_path: Path, capfd: pytest.CaptureFixt
     assert {path.parent.name for path in unchanged} == {'full'}
     assert main([*command, '--set', 'seed=1']) == 2
     assert 'holds a run with other settings' in capfd.readouterr().err
+
+
+def test_a_run_is_a_process_of_its_own(capfd: pytest.CaptureFixture[str]) -> None:
+    assert run_in_own_process(['run', '--help']) == 0
+    assert 'usage: splatam run' in capfd.readouterr().out
+    assert run_in_own_process(['run', 'no-such-recording']) == 2
 
 
 def test_an_unknown_ablation_lists_the_known(capsys: pytest.CaptureFixture[str]) -> None:
