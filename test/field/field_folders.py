@@ -78,15 +78,20 @@ def with_truth(folder: Path, lines: Sequence[str], texts: Sequence[str] | None =
     return folder
 
 
-def wrong_stamp(stamp: str) -> Callable[[Path], Path]:
-    """A truth whose fourth pose has another stamp."""
+def fourth_pose(change: Callable[[str, str], str]) -> Callable[[Path], Path]:
+    """A truth whose fourth line is another one. change: makes it of the line's stamp and pose."""
 
     def write(folder: Path) -> Path:
         lines = pose_lines(stamps())
-        lines[3] = f'{stamp} {lines[3].split(maxsplit=1)[1]}'
+        lines[3] = change(*lines[3].split(maxsplit=1))
         return with_truth(folder, lines)
 
     return write
+
+
+def wrong_stamp(stamp: str) -> Callable[[Path], Path]:
+    """A truth whose fourth pose has another stamp."""
+    return fourth_pose(lambda _, pose: f'{stamp} {pose}')
 
 
 def metres_per_count(folder: Path) -> Path:
@@ -96,15 +101,9 @@ def metres_per_count(folder: Path) -> Path:
     return folder
 
 
-def unknown(pose: str) -> Callable[[Path], Path]:
-    """A truth whose fourth pose is unknown. pose: what stands for it after the stamp."""
-
-    def write(folder: Path) -> Path:
-        lines = pose_lines(stamps())
-        lines[3] = f'{stamps()[3]} {pose}'
-        return with_truth(folder, lines)
-
-    return write
+def unknown(text: str) -> Callable[[Path], Path]:
+    """A truth whose fourth pose is unknown. text: what stands for it after the stamp."""
+    return fourth_pose(lambda stamp, _: f'{stamp} {text}')
 
 
 def numbered(folder: Path) -> Path:
