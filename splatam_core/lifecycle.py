@@ -326,8 +326,8 @@ class SlamLifecycle:
             return None
         if not (self._mapper.schedule.plan(current.index, 0.0).is_used and shows_a_place(seen.host)):
             return None
+        self._leave(current)
         T_world_cam = self._motion.trusted_pose.copy()
-        self.graph.interrupt(TrackedFrame(current.index - 1, current.frame.stamp_ns - 1, T_world_cam, np.zeros((6, 6))))
         T_world_cam[0, 3] = float(self.map.means.detach()[:, 0].max()) + _APART_M
         posed = PosedFrame(seen, se3.inverse(T_world_cam), self.config.mapping, current.index)
         plan = self._mapper.schedule.plan(0, visible_fraction=0.0)
@@ -341,6 +341,12 @@ class SlamLifecycle:
         self._follow_graph(current, T_world_cam, begins=True)
         _log.warning('frame %d: the camera is in a place that the map does not show: a new map starts beside it', current.index)
         return current.result(self._judge.start(), T_world_cam, self, is_keyframe=True)
+
+    def _leave(self, current: CurrentFrame) -> None:
+        """Tells the graph that the camera is elsewhere than it was: frames until now move with the keyframes before them."""
+        if self.graph.is_used and len(self.graph.nodes):
+            before = TrackedFrame(current.index - 1, current.frame.stamp_ns - 1, self._motion.trusted_pose, np.zeros((6, 6)))
+            self.graph.interrupt(before)
 
     def _follow_graph(
         self, current: CurrentFrame, T_world_cam: Matrix, evidence: Evidence | None = None, found_at: int | None = None, *,

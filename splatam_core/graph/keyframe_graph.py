@@ -11,9 +11,9 @@ long as it takes to correct the map at it.
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -224,10 +224,14 @@ class KeyframeGraph:
         self._links.append(Link.measured(before, node, step, Kind.ODOMETRY, frame.covariance, gap))
 
     def _take_out_dropped(self, by_frame: dict[int, PosedView]) -> None:
-        """Takes out the nodes that have no images. The first and the last of each map stay: what is beside them moves with them."""
-        ways = Counter(node for link in self._links if link.kind is Kind.ODOMETRY for node in (link.first, link.second))
-        for node in [node for node in self._active[1:-1] if int(self.nodes.frames[node]) not in by_frame and ways[node] > 1]:
-            self._merge(node)
+        """Takes out the nodes that have no images, where the way leads on from the one before to the one after.
+
+        Those at which the camera was lost, or found elsewhere, stay: what is beside them moves with them.
+        """
+        ways = {(link.first, link.second) for link in self._links if link.kind is Kind.ODOMETRY}
+        for before, node, after in list(zip(self._active, self._active[1:], self._active[2:])):
+            if int(self.nodes.frames[node]) not in by_frame and {(before, node), (node, after)} <= ways:
+                self._merge(node)
 
     def settle(self, newest: TrackedFrame | None) -> Corrections | None:
         """Returns how poses and map are corrected so that they agree best with all edges; None without a loop.
@@ -308,15 +312,29 @@ class KeyframeGraph:
         return [old[index] for index in np.argsort(-seen, kind='stable')[:_CANDIDATES] if seen[index] >= _LEAST_OVERLAP]
 
     def _look(self, node: int, by_frame: dict[int, PosedView], places: Places) -> None:
-        """Queues the comparison with places that show the same features, wherever they are, if none was found nearby."""
-        keyframe = by_frame.get(int(self.nodes.frames[node]))
-        is_found = any(link.second == node and link.kind not in (Kind.ODOMETRY, Kind.WINDOW) for link in self._links)
-        if is_found or keyframe is None:
+        """Queues the comparison with places that show the same features, wherever they are, if none was found nearby.
+
+        Otherwise with those of maps that lie beside this one until a place of both is recognised.
+        """
+        keyframe, old = by_frame.get(int(self.nodes.frames[node])), self._old(node, by_frame)
+        if any(link.second == node and link.kind not in (Kind.ODOMETRY, Kind.WINDOW) for link in self._links):
+            old = self._elsewhere(node, old)
+        if keyframe is None or not old:
             return
-        number = {int(self.nodes.frames[n]): n for n in self._old(node, by_frame)}
+        number = {int(self.nodes.frames[n]): n for n in old}
         for frame in places.candidates(keyframe.view, [frame for frame in by_frame if frame not in number]):
             if frame in number:
                 self._queue(Work.COMPARE, number[frame], node)
+
+    def _elsewhere(self, node: int, others: Sequence[int]) -> list[int]:
+        """Returns those of other nodes that nothing joins to a node."""
+        ways = {(link.first, link.second) for link in self._links if link.kind is Kind.ODOMETRY}
+        own = [n for n in self._active if self.nodes.frames[n] >= 0]
+        if set(pairwise(own)) <= ways:
+            return []  # the camera was never lost
+        part = dict(zip(self._active, parts(len(self._active), renumbered(self._sure(len(self._links)), self._active)).tolist()))
+        num_loaded = len(self._active) - len(own)  # they are one map, although nothing joins them
+        return [n for n in others if max(part[n], num_loaded) != max(part[node], num_loaded)]
 
     def _compare(self, task: Task, by_frame: dict[int, PosedView], places: Places) -> None:
         """Compares the features of two keyframes; aligns them next if they show the same."""

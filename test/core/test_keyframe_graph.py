@@ -285,3 +285,42 @@ def test_a_new_map_joins_the_old_one_where_loops_say() -> None:
     nodes = camera.graph.nodes
     off = np.linalg.norm((nodes.T_world_cam - truth[nodes.frames // EVERY])[:, :3, 3], axis=1)
     assert off.max() < 0.1
+
+
+def test_a_new_map_joins_while_it_is_seen_again_itself() -> None:
+    """Places of its own are near the camera at every keyframe by then; those of the old map are looked for nevertheless."""
+    way = 0.05 * np.concatenate([np.arange(25), np.full(35, 29), 29 - np.arange(20)])
+    camera = Drifting(motions.exp(way[:, None] * np.array([1, 0, 0, 0, 0.1, 0.0]))).run(end=25)
+    camera.places, camera.begins = TruePlaces(camera), 32
+    camera.graph.interrupt(replace(FRAME, index=EVERY * 24 + 4, stamp_ns=245, T_world_cam=camera.where))
+    camera.where = se3.exp(np.array([30, 0, 0, 0, 0.5, 0])) @ camera.truth[31]
+    camera.run(begin=32, end=60)
+    assert camera.graph.num_loops > 0 and camera.graph.nodes.T_world_cam[-1, 0, 3] > 20
+    camera.run(begin=60)
+    nodes = camera.graph.nodes
+    off = np.linalg.norm((nodes.T_world_cam - camera.truth[nodes.frames // EVERY])[:, :3, 3], axis=1)
+    assert off.max() < 0.1
+
+
+def test_what_was_tracked_before_and_after_a_loss_moves_with_its_own_map() -> None:
+    """The camera is found in the old map, between two keyframes, while it was in a new one."""
+    graph, apart = KeyframeGraph(CONFIG, TorchAligner()), se3.exp(np.array([30.0, 0, 0, 0, 0, 0]))
+    old, new = np.repeat(np.eye(4)[None], 9, axis=0), np.repeat(apart[None], 9, axis=0)
+    view = View(CAMERA, torch.zeros(24, 32, 3, dtype=torch.uint8), torch.full((24, 32), 2.0))
+    graph._pairs, kept = TruePairs(old), []
+    graph._pairs.numbers[view] = 0
+    way = [(0, old, {}), (5, old, {}), (8, old, None), (9, new, {'begins': True}), (15, new, {}), (21, new, None),
+           (22, old, {'found_at': 5}), (25, old, {}), (30, old, {})]  # fmt: skip
+    for index, T, options in way:
+        frame = replace(FRAME, index=index, stamp_ns=index, T_world_cam=T[0])
+        if options is None:
+            graph.interrupt(frame)
+            continue
+        if 'found_at' not in options:
+            kept.append(PosedView.at(view, se3.inverse(T[0]), index))
+        graph.follow(replace(frame, **options), kept)
+    assert graph.nodes.frames[graph._active].tolist() == [0, 5, 8, 9, 15, 21, 22, 25, 30]
+    solution = np.repeat(np.eye(4)[None], len(graph._active), axis=0)
+    graph._corrections(solution, graph._active)
+    stamps_ns, published = np.arange(0, 31), np.array([(new if 9 <= stamp < 22 else old)[0] for stamp in range(31)])
+    np.testing.assert_allclose(graph.corrected(stamps_ns, published), np.repeat(np.eye(4)[None], 31, axis=0), atol=1e-9)
