@@ -124,9 +124,7 @@ class CoordinateFrames:
         if T_map_world is None:
             T_map_world = self._new_map(T_body_camera)
         T_map_camera = T_map_world @ T_world_cam
-        T_map_steady = np.eye(4)
-        if T_world_odom is not None and not (T_world_odom == np.eye(4)).all():
-            T_map_steady = T_map_world @ T_world_odom @ se3.inverse(T_map_world)
+        T_map_steady = _steady(T_map_world, T_world_odom)
         return Located(
             stamp_ns=stamp_ns,
             camera_frame=camera_frame,
@@ -192,6 +190,19 @@ class CoordinateFrames:
         link = self._options.map_frame, self._options.odom_frame
         return {link: moving[link]} if link in moving else {}
 
+    def corrected(self, lasting: Mapping[Link, Matrix], located: Located, T_world_odom: Matrix) -> dict[Link, Matrix]:
+        """Returns transforms from the map that were right at a frame, after the corrections since.
+
+        Args:
+            lasting: the transforms.
+            located: the frame.
+            T_world_odom: [4, 4] all corrections of the core's world until now.
+        """
+        now = _steady(located.T_map_world, T_world_odom)
+        if (now == located.T_map_steady).all():
+            return dict(lasting)
+        return {link: now @ se3.inverse(located.T_map_steady) @ T for link, T in lasting.items()}
+
     def static(self, camera_frame: str) -> dict[Link, Matrix]:
         """Returns the transforms to publish on ``/tf_static``: the camera in the base, unless someone else publishes it."""
         if self._T_base_camera is None:
@@ -223,6 +234,13 @@ class CoordinateFrames:
             return T_map_camera @ se3.inverse(self.odometry(camera_frame, stamp_ns))
         except TransformError:  # OdometryPrior has waited for it and has warned
             return None
+
+
+def _steady(T_map_world: Matrix, T_world_odom: Matrix | None) -> Matrix:
+    """Returns all corrections [4, 4] of the core's world, as motions in the map; see ``Located.T_map_steady``."""
+    if T_world_odom is None or (T_world_odom == np.eye(4)).all():
+        return np.eye(4)
+    return T_map_world @ T_world_odom @ se3.inverse(T_map_world)
 
 
 def parse_pose(name: str, text: str) -> Matrix:

@@ -90,15 +90,23 @@ class RobotFrames:
     def begin_map(self) -> None:
         """Forget where the odometry is in the map, and which way is up: a new map begins."""
         self._held: dict[Link, Matrix] = {}
+        self._held_at: Located | None = None
         self._up_world = None
 
     def publish(self, located: Located) -> None:
         """Publish the transforms of a tracked camera."""
         moving = self._frames.moving(located)
-        self._held = self._frames.lasting(moving) or self._held
+        if lasting := self._frames.lasting(moving):
+            self._held, self._held_at = lasting, located
         self._tf.publish(located.stamp_ns, moving)
         self._tf.publish_static(located.stamp_ns, self._frames.static(located.camera_frame))
 
-    def hold(self, stamp_ns: int) -> None:
-        """Publish the last transform from map to odom once more, for a frame whose pose is uncertain or not known."""
-        self._tf.publish(stamp_ns, self._held)
+    def hold(self, stamp_ns: int, T_world_odom: Matrix) -> None:
+        """Publish the last transform from map to odom once more, for a frame whose pose is uncertain or not known.
+
+        Args:
+            stamp_ns: stamp of the frame.
+            T_world_odom: [4, 4] all corrections of the core's world so far: the map may have been corrected since.
+        """
+        if self._held_at is not None:
+            self._tf.publish(stamp_ns, self._frames.corrected(self._held, self._held_at, T_world_odom))

@@ -343,7 +343,7 @@ class Outputs:
         if result.T_world_cam is not None and located is not None and self._node.context.ok():
             self._publish_pose(located, result.T_world_cam, result, slam)
         if not result.status.is_trusted and self._node.context.ok():
-            self._frames.hold(result.stamp_ns)
+            self._frames.hold(result.stamp_ns, result.T_world_odom)
         self.publish_processed(result.stamp_ns)
         if self._viewer is not None:
             self._viewer.take(frame, result, slam)

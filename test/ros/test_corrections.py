@@ -59,6 +59,25 @@ def test_odometry_stays_continuous() -> None:
         np.testing.assert_allclose(moving['odom', 'camera'], np.linalg.matrix_power(STEP, number), atol=1e-12)
 
 
+@pytest.mark.parametrize('source', ['none', 'topic'])
+def test_a_lost_robot_goes_on_in_the_corrected_map(source: str) -> None:
+    """Map to odom of the last tracked frame moves with the map that was corrected after it."""
+    parameters = {'odom.source': source, 'base_frame': 'base', 'camera_in_base': '0 0 1 0 0 0', 'world_up': 'z_up'}
+    buffer = TransformBuffer()
+    for stamp_ns in (9 * 10**8, 11 * 10**8):
+        buffer.add('odom', 'base', stamp_ns, np.eye(4))
+    frames = CoordinateFrames(node_options(parameters).frames, buffer, NoWarnings())  # type: ignore[arg-type]
+    before = frames.locate(SECOND_NS, 'camera', STEP, None, np.eye(4))
+    assert before is not None
+    after = frames.locate(SECOND_NS, 'camera', JUMP @ STEP, before.T_map_world, JUMP)
+    assert after is not None
+    lasting, expected = (frames.lasting(frames.moving(each)) for each in (before, after))
+    held = frames.corrected(lasting, before, JUMP)
+    np.testing.assert_allclose(held['map', 'odom'], expected['map', 'odom'], atol=1e-12)
+    assert frames.corrected(lasting, before, np.eye(4)) == lasting
+    assert np.linalg.norm(held['map', 'odom'][:3, 3]) > 0.1
+
+
 def test_velocity_is_without_the_jump() -> None:
     estimator, twists = MotionEstimator(0.01, 0.01), []
     for number in range(2, 6):
