@@ -142,8 +142,8 @@ class MapLifecycle:
             return
         self._logger.warning('time jumped back: continuing in the same map, from the last pose')
         self._recorder.start_over(slam)  # the stamps of a trajectory must increase
+        self._outputs.end_time(slam)
         slam.rest(is_new_time=True)
-        self._outputs.interrupt_motion()
 
     # --- on request ---
 

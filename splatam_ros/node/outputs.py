@@ -17,6 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from msg_adapters import images, markers, point_clouds, poses, stamps
 from msg_adapters.factory import MessageFactory, RclpyMessages, message_class
+from splatam_core.graph.keyframe_graph import KeyframeGraph
 from splatam_core.slam import Slam
 from splatam_core.types import FrameResult, RenderedView, RgbdFrame
 from splatam_ros.frames.covariance import Motion, MotionEstimator
@@ -231,11 +232,15 @@ OUTPUTS = (
 
 @dataclass(slots=True, eq=False)
 class _Place:
-    """A pose of the path: the camera in the core's world as it was tracked, and as a message after the corrections so far."""
+    """A pose of the path: the camera in the core's world as it was tracked, and as a message after the corrections so far.
+
+    ``is_past`` says that it is where it will stay, because stamps began anew after it.
+    """
 
     stamp_ns: int
     T_world_cam: Matrix
     message: Any
+    is_past: bool = False
 
 
 class PathHistory:
@@ -261,16 +266,33 @@ class PathHistory:
 
     def poses(self, context: PublishContext) -> list[Any]:
         """Returns the poses as messages, in order, as the graph of ``context.slam`` corrects them."""
-        is_last = self._newest is None or (self._kept and self._kept[-1] is self._newest)
-        places = list(self._kept) if is_last or self._newest is None else [*self._kept, self._newest]
-        graph = context.slam.graph
+        places, graph = self._places(), context.slam.graph
         if places and graph.num_corrections != self._num_corrections:
-            stamps_ns, tracked = np.array([place.stamp_ns for place in places]), np.array([place.T_world_cam for place in places])
-            for place, T_world_cam in zip(places, graph.corrected(stamps_ns, tracked)):
+            for place, T_world_cam in zip(places, _corrected(places, graph)):
                 T_map_cam = context.located.T_map_world @ T_world_cam
                 place.message = poses.pose_stamped(context.factory, T_map_cam, place.stamp_ns, context.map_frame)
             self._num_corrections = graph.num_corrections
         return [place.message for place in places]
+
+    def end_time(self, graph: KeyframeGraph) -> None:
+        """Keep the poses so far where the graph has them now: it will not know them, because stamps begin anew."""
+        places = self._places()
+        for place, T_world_cam in zip(places, _corrected(places, graph)):
+            place.T_world_cam, place.is_past = T_world_cam, True
+        self._num_corrections = -1  # the messages are older
+
+    def _places(self) -> list[_Place]:
+        is_last = self._newest is None or (self._kept and self._kept[-1] is self._newest)
+        return list(self._kept) if is_last or self._newest is None else [*self._kept, self._newest]
+
+
+def _corrected(places: Sequence[_Place], graph: KeyframeGraph) -> Matrix:
+    """Returns [N, 4, 4] where poses of the path are after all corrections."""
+    result = np.array([place.T_world_cam for place in places]).reshape(-1, 4, 4)
+    moves = np.array([not place.is_past for place in places], dtype=bool)
+    stamps_ns = np.array([place.stamp_ns for place in places], dtype=np.int64)
+    result[moves] = graph.corrected(stamps_ns[moves], result[moves])
+    return result
 
 
 class Outputs:
@@ -322,9 +344,14 @@ class Outputs:
         if self._viewer is not None:
             self._viewer.begin_map()
 
-    def interrupt_motion(self) -> None:
-        """Report no velocity between the last pose and the next one, e.g. because time jumped."""
+    def end_time(self, slam: Slam) -> None:
+        """Prepare for stamps that begin anew: no velocity is reported to the next pose, and the path so far stays where it is."""
         self._motion.interrupt()
+        self._path.end_time(slam.graph)
+
+    def refresh(self) -> None:
+        """Publish the latched topics once more, because the map has changed without a frame."""
+        self._published_ns.clear()
 
     def publish(self, frame: RgbdFrame, result: FrameResult, located: Located | None, slam: Slam) -> None:
         """Publish what is due for a frame, all with its stamp.

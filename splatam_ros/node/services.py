@@ -112,7 +112,7 @@ class Services:
         return await self._on_worker(self._lifecycle.save)
 
     async def _optimize(self) -> Trigger.Response:
-        return await self._on_worker(_optimize)
+        return await self._on_worker(self._optimize_graph)
 
     async def _load_map(self) -> Trigger.Response:
         return await self._on_worker(self._lifecycle.load)
@@ -127,6 +127,14 @@ class Services:
 
     def _reset_slam(self, slam: Slam) -> str:
         return self._lifecycle.reset(slam, 'requested by ~/reset')
+
+    def _optimize_graph(self, slam: Slam) -> str:
+        if not slam.graph.is_used:
+            raise ConfigError('there is no keyframe graph: set slam.graph.enabled to true')
+        moved_m = slam.optimize_graph()
+        self._outputs.refresh()
+        summary = slam.graph.summary
+        return f'{summary.nodes} keyframes with {summary.loops} loops: corrected by at most {100 * moved_m:.1f} cm'
 
     async def _on_worker(self, action: Callable[[Slam], str]) -> Trigger.Response:
         """Run an action between two frames; it returns the message of the answer."""
@@ -167,14 +175,6 @@ def _handler(action: Callable[[], Awaitable[Trigger.Response]]) -> Callable[...,
 def _rest(slam: Slam) -> str:
     slam.rest()
     return 'resumed'
-
-
-def _optimize(slam: Slam) -> str:
-    graph = slam.graph
-    if not graph.is_used:
-        raise ConfigError('there is no keyframe graph: set slam.graph.enabled to true')
-    moved_m = slam.optimize_graph()
-    return f'{len(graph.nodes)} keyframes with {graph.num_loops} loops: corrected by at most {100 * moved_m:.1f} cm'
 
 
 def _succeeded(message: str) -> Trigger.Response:

@@ -110,6 +110,28 @@ def test_the_path_follows(is_corrected: bool) -> None:
     np.testing.assert_allclose(shown[0], np.eye(4), atol=1e-9)
 
 
+def test_the_path_before_a_jump_in_time_stays() -> None:
+    """Its stamps are those of other frames then, and its keyframes are no longer in the graph."""
+    factory, path = RclpyMessages(), PathHistory(100)
+
+    def walk() -> None:
+        for number in range(3):
+            T = np.linalg.matrix_power(STEP, number)
+            path.append(number * SECOND_NS, T, poses.pose_stamped(factory, T, number * SECOND_NS, 'map'))
+
+    walk()
+    before = corrected_graph()
+    path.end_time(before)  # type: ignore[arg-type]
+    walk()
+    after = SimpleNamespace(num_corrections=2, corrected=lambda stamps_ns, T: np.linalg.matrix_power(JUMP, 3) @ T)
+    context: Any = SimpleNamespace(
+        slam=SimpleNamespace(graph=after), located=located(2, is_corrected=False), factory=factory, map_frame='map'
+    )
+    shown = [poses.pose_matrix(message.pose) for message in path.poses(context)]
+    np.testing.assert_allclose(shown[2], JUMP @ np.linalg.matrix_power(STEP, 2), atol=1e-9)
+    np.testing.assert_allclose(shown[3], np.linalg.matrix_power(JUMP, 3), atol=1e-9)
+
+
 def test_a_graph_is_three_markers() -> None:
     centres = motions.exp(np.arange(3)[:, None] * np.array([1.0, 0, 0, 0, 0, 0]))[:, :3, 3]
     edges, loops = np.array([(0, 1), (1, 2)]), np.array([(0, 2)])

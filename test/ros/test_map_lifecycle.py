@@ -97,7 +97,7 @@ def test_a_reset_begins_another_map() -> None:
 
 @pytest.mark.parametrize(
     ('policy', 'slam', 'outputs', 'second'),
-    [('reset', 'reset', 'begin_map', 'new map'), ('continue', 'rest', 'interrupt_motion', 'same map')],
+    [('reset', 'reset', 'begin_map', 'new map'), ('continue', 'rest', 'end_time', 'same map')],
 )
 def test_a_time_jump_is_handled_once_and_as_configured(policy: str, slam: str, outputs: str, second: str) -> None:
     bench = Bench(on_time_jump=policy)

@@ -327,6 +327,12 @@ def test_what_costs_is_made_for_listeners_only_and_at_its_rate(
     clock.now_s += 1.0
     publish_for(0.5)
     assert slam.snapshots == 4 + 25  # with every pose
+    outputs.serve_late_subscribers(slam)
+    assert slam.snapshots == 4 + 25
+    outputs.refresh()  # the map has changed without a frame
+    assert outputs.has_late_subscriber
+    outputs.serve_late_subscribers(slam)
+    assert slam.snapshots == 4 + 25 + 1
 
 
 def check_cloud(cloud: PointCloud2, count: int) -> None:
