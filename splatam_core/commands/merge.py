@@ -77,16 +77,29 @@ def _check_they_differ(first: RunRecord, second: RunRecord, first_map: SavedMap,
     """Checks that two runs are not the same, and that their maps are of one kind.
 
     Raises:
-        MergeError: they are the same, or one is isotropic and the other is not.
+        MergeError: they are the same, one holds the other, or one is isotropic and the other is not.
     """
     import torch
 
     means = first_map.gaussians.means, second_map.gaussians.means
     if first.path.resolve() == second.path.resolve() or (means[0].shape == means[1].shape and torch.equal(*means)):
         raise MergeError(f'{first.path} and {second.path} are the same run: there is nothing to merge')
+    features = [_features(one) for one in (first_map, second_map)]
+    for runs, is_held in (((first, second), features[0] <= features[1]), ((second, first), features[1] <= features[0])):
+        if is_held and all(features):
+            raise MergeError(f'{runs[1].path} has all keyframes of {runs[0].path} already: there is nothing to merge')
     kinds = ['isotropic' if one.gaussians.rotations is None else 'anisotropic' for one in (first_map, second_map)]
     if kinds[0] != kinds[1]:
         raise MergeError(f'{first.path} has {kinds[0]} Gaussians and {second.path} {kinds[1]} ones: maps of one kind can be merged')
+
+
+def _features(one: SavedMap) -> set[bytes]:
+    """Returns what the keyframes of a map are recognised by, one entry each. Merging keeps it bit for bit."""
+    places, first, result = one.saved.places, 0, set()
+    for count in places['counts'].tolist():
+        result.add(places['descriptors'][first : first + count].tobytes() + places['points'][first : first + count].tobytes())
+        first += count
+    return result - {b''}  # without features
 
 
 def _why_not_joined(joint: Joint, args: argparse.Namespace) -> str:

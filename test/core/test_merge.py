@@ -96,6 +96,16 @@ def test_a_camera_finds_itself_in_the_merged_map(merged: Path) -> None:
     assert results[1].status is Status.TRACKED
 
 
+def test_a_run_that_was_merged_is_not_merged_again(
+    runs: tuple[Path, Path], merged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for pair in ((merged, runs[1]), (runs[0], merged)):
+        capsys.readouterr()
+        assert splatam('merge', *pair, '--out', tmp_path / 'out') == 2
+        assert f'{merged} has all keyframes of' in error_line(capsys)
+    assert not (tmp_path / 'out').exists()
+
+
 @pytest.mark.parametrize('fault', ['same', 'copied', 'another room', 'no keyframes', 'anisotropic'])
 def test_runs_that_cannot_be_joined(
     runs: tuple[Path, Path], fault: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
