@@ -66,6 +66,7 @@ _MARGIN = 0.03  # of the width
 _WORK_PER_KEYFRAME = 10  # alignments: a little more than a keyframe needs
 _MOST_TASKS = 40  # beyond it, places are not looked for by features
 _STEPS_PER_FRAME = 2  # of the optimisation
+_MOST_LOOPS = 10  # of a keyframe that takes over those of another one: a place seen for hours has no more than one seen twice
 
 _NO_POSES = np.empty((0, 4, 4))
 _LINK_ARRAYS = 'T_first_second', 'information', 'limits', 'kinds'
@@ -516,8 +517,10 @@ class KeyframeGraph:
             information = inverse(covariance + inverse(link.information))
             self._links.append(Link(first, second, motions.between(T[first], T[second]), information))
         step = motions.between(T[into], T[node])
-        for link in own:
-            if link.kind in (Kind.ODOMETRY, Kind.WINDOW) or into in (link.first, link.second):
+        handed_over = [link for link in own if link.kind not in (Kind.ODOMETRY, Kind.WINDOW)]
+        has = sum(link.kind not in (Kind.ODOMETRY, Kind.WINDOW) and into in (link.first, link.second) for link in self._links)
+        for link in handed_over[: max(0, _MOST_LOOPS - has)]:
+            if into in (link.first, link.second):
                 continue
             is_first = link.first == node
             motion = step @ link.T_first_second if is_first else link.T_first_second @ se3.inverse(step)

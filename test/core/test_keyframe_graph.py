@@ -141,6 +141,16 @@ def test_dropped_keyframes_leave_the_graph_small() -> None:
     assert camera.errors_m()[-1] < 0.08 < 200 * np.linalg.norm(DRIFT[:3])
 
 
+@pytest.mark.parametrize('budget', [4, 12])
+def test_a_place_that_is_seen_for_hours_keeps_the_graph_small(budget: int) -> None:
+    """Keyframes that are dropped hand their loops over, again and again to the same few."""
+    way = 0.02 * np.abs(np.arange(150) % 10 - 5)
+    camera = Drifting(motions.exp(way[:, None] * np.array([1, 0, 0, 0, 0.1, 0.0])), budget=budget).run()
+    assert camera.graph.num_loops > budget
+    assert len(camera.graph._links) < 15 * (budget + 2)  # odometry and pairs, and the two loops of each new keyframe
+    assert camera.errors_m().max() < 0.2 < 150 * np.linalg.norm(DRIFT[:3])
+
+
 def test_a_keyframe_takes_at_most_60_kb_beside_its_images() -> None:
     """Features and edges, with as many loops as are looked for; objects of Python take as much again as the numbers in them."""
     graph = Drifting(there_and_back(100)).run().graph
