@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,6 +33,7 @@ from splatam_core.rasterizer import Gaussians, make_rasterizer
 from splatam_core.state import NO_KEYFRAMES, SavedKeyframes, SlamState
 from splatam_core.stopwatch import Stopwatch
 from splatam_core.tracking import Tracker, TrackingResult, make_tracker
+from splatam_core.tracking.aligner import Aligner
 from splatam_core.tracking.alignment import make_aligner
 from splatam_core.tracking.evidence import Evidence
 from splatam_core.tracking.motion import MotionModel, MotionPrior, Prediction
@@ -166,7 +168,7 @@ class SlamLifecycle:
         check_truth(config, self._true_motion)
         self.config = config
         self._mapper.configure(config)
-        self.graph.configure(config)
+        self.graph.configure(config, self._new_graph_aligner() if self.graph.lacks_aligner else None)
         self._tracker = self._new_tracker()
 
     def load(self, gaussians: Gaussians, T_world_cam: Matrix | None, saved: SavedKeyframes = NO_KEYFRAMES) -> None:
@@ -426,13 +428,17 @@ class SlamLifecycle:
         return Mapper(self.config, self._rasterizer, self.backend.device, self._recording_length, self._stop)
 
     def _new_graph(self) -> KeyframeGraph:
-        aligner = None
-        if self.config.graph.enabled:
-            try:
-                aligner = make_aligner(self.config.threads, HOST)  # keyframes are there
-            except RasterizerError as error:
-                _log.warning('there is no keyframe graph, as if graph.enabled were false: %s', error)
-        return KeyframeGraph(self.config, aligner)
+        return KeyframeGraph(self.config, self._new_graph_aligner())
+
+    def _new_graph_aligner(self) -> Aligner[Any] | None:
+        """Returns what aligns keyframes, which are in the host's memory; None if there is no graph."""
+        if not self.config.graph.enabled:
+            return None
+        try:
+            return make_aligner(self.config.threads, HOST)
+        except RasterizerError as error:
+            _log.warning('there is no keyframe graph, as if graph.enabled were false: %s', error)
+            return None
 
     def _new_tracker(self) -> Tracker:
         return make_tracker(self._rasterizer, self.config.tracking, self.config.threads, self.backend.device, self._stop)

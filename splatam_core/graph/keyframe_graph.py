@@ -141,8 +141,14 @@ class KeyframeGraph:
         self.T_world_odom: Matrix = np.eye(4)
         self.configure(config)
 
-    def configure(self, config: SlamConfig) -> None:
-        """Uses other settings from the next keyframe on."""
+    def configure(self, config: SlamConfig, aligner: Aligner[Any] | None = None) -> None:
+        """Uses other settings from the next keyframe on.
+
+        Args:
+            config: every setting.
+            aligner: for images in the host's memory, where the graph is switched on only now; None = as before.
+        """
+        self._aligner = aligner or self._aligner
         self._config, self._seed, self._every = config.graph, config.seed, config.keyframes.every
         self._work_per_frame = -(-_WORK_PER_KEYFRAME // self._every)
         self._pairs = PairAligner(self._aligner, config.tracking) if self._aligner is not None else None
@@ -151,6 +157,11 @@ class KeyframeGraph:
     def is_used(self) -> bool:
         """Whether keyframes are added."""
         return self._config.enabled and self._pairs is not None
+
+    @property
+    def lacks_aligner(self) -> bool:
+        """Whether it was made without one."""
+        return self._aligner is None
 
     @property
     def num_loops(self) -> int:

@@ -81,6 +81,18 @@ def test_without_a_graph_nothing_is_kept(there_and_back: list[RgbdFrame]) -> Non
     assert (slam.graph.corrected(np.array([result.stamp_ns for result in results]), poses) == poses).all()
 
 
+def test_it_can_be_switched_on_and_off_between_frames(there_and_back: list[RgbdFrame]) -> None:
+    slam = slam_with('graph.enabled=false')
+    sizes = []
+    for number, frame in enumerate(there_and_back):
+        if number in (2, 6, 10):
+            slam.configure(replace(slam.config, graph=replace(slam.config.graph, enabled=number != 6)))
+        assert slam.process(frame).status.is_trusted
+        sizes.append(slam.graph.summary.nodes)
+    assert sizes[:2] == [0, 0] and sizes[5] == sizes[9] > 1 and sizes[-1] > sizes[9]
+    assert slam.optimize_graph() >= 0 and slam.graph.num_loops > 0
+
+
 @pytest.mark.parametrize(('broken', 'costs_the_frame'), [('track', True), ('_plan', False)])
 def test_a_system_that_cannot_be_solved_costs_at_most_the_frame(
     there_and_back: list[RgbdFrame],
