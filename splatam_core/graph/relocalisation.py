@@ -187,8 +187,14 @@ class Relocaliser:
         return Verdict(Status.LOST, 'the camera is lost, and looked for on every n-th frame only (relocalisation.every)')
 
     def interrupt(self) -> None:
-        """Forgets what the next frame was to confirm, because its stamp says nothing about the time since then."""
-        self.state = replace(self.state, recognised=None)
+        """Forgets what the next frame was to confirm, because its stamp says nothing about the time since then.
+
+        A pose that a person told is tried once more.
+        """
+        told, recognised = self.state.told, self.state.recognised
+        if recognised is not None and recognised.keyframe == TOLD:
+            told = recognised.T_world_cam
+        self.state = replace(self.state, told=told, recognised=None)
 
     def tell(self, T_world_cam: Matrix) -> None:
         """Notes a pose [4, 4] that a person told; the next frame is tried there first."""
@@ -211,7 +217,9 @@ class Relocaliser:
         if self.state.told is not None:
             self._try_told(sight)
         elif verdict.status.is_trusted:
-            self.state = RelocaliserState()
+            recognised = self.state.recognised  # a person may know that it is tracked at a wrong place
+            is_told = recognised is not None and recognised.keyframe == TOLD
+            self.state = RelocaliserState(recognised=recognised if is_told else None)
         elif self.state.recognised is not None:
             self._count()
         elif sight.config.relocalises:

@@ -27,6 +27,8 @@ from splatam_core.runs.checkpoints import Checkpoints, Progress, read_newest
 from splatam_core.runs.map_keyframes import KIND, VERSION, read_map_keyframes, write_map_keyframes
 from splatam_core.slam import Slam
 from splatam_core.state import SlamState
+from splatam_core.tracking import TrackingResult
+from splatam_core.tracking.verdict import Verdict
 from splatam_core.types import FrameResult, RgbdFrame, Status
 
 MAPPED = range(0, 56, 4)  # half a turn
@@ -287,3 +289,28 @@ def test_a_pose_that_is_told_is_verified(walk: Walk, caplog: pytest.LogCaptureFi
     assert [result.is_relocalised for result in results] == [False, is_right, False]
     assert results[2].status.is_trusted == is_right
     assert sum('is refused' in record.message for record in caplog.records) == (not is_right)
+
+
+@pytest.mark.parametrize('rests', [False, True])
+def test_a_pose_that_is_told_to_a_tracked_camera_is_answered(
+    walk: Walk, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, rests: bool
+) -> None:
+    """Whatever the frames after it say: it is tracked already, and where the person says it cannot be sure. Or there is a pause."""
+
+    class Unsure(relocalisation.Judge):
+        def decide(self, *args: object) -> tuple[TrackingResult, Verdict]:
+            result, verdict = super().decide(*args)
+            return result, dataclasses.replace(verdict, status=Status.UNCERTAIN)
+
+    slam = in_the_map(walk)
+    show(slam, walk.away, walk.state.last_stamp_ns)
+    slam.suggest(walk.true[-1])
+    if rests:
+        show(slam, walk.away[-1:], slam.state().last_stamp_ns)
+        slam.rest()
+    else:
+        monkeypatch.setattr(relocalisation, 'Judge', Unsure)
+    results = show(slam, walk.away[-1:] * 6, slam.state().last_stamp_ns or 10**12)
+    assert all(result.status.is_trusted for result in results)
+    is_refused = 'is refused: the next frames do not confirm it' in caplog.text
+    assert [is_refused, any(result.is_relocalised for result in results)] == [not rests, rests]
