@@ -328,9 +328,9 @@ class SlamLifecycle:
             return None
         if not (self._mapper.schedule.plan(current.index, 0.0).is_used and shows_a_place(seen.host)):
             return None
-        self._leave(current)
         T_world_cam = self._motion.trusted_pose.copy()
         T_world_cam[0, 3] = float(self.map.means.detach()[:, 0].max()) + _APART_M
+        current = self._leave(current, T_world_cam, begins=True)
         posed = PosedFrame(seen, se3.inverse(T_world_cam), self.config.mapping, current.index)
         plan = self._mapper.schedule.plan(0, visible_fraction=0.0)
         self._mapper.densify(posed, plan)
@@ -344,11 +344,24 @@ class SlamLifecycle:
         _log.warning('frame %d: the camera is in a place that the map does not show: a new map starts beside it', current.index)
         return current.result(self._judge.start(), T_world_cam, self, is_keyframe=True)
 
-    def _leave(self, current: CurrentFrame) -> None:
-        """Tells the graph that the camera is elsewhere than it was: frames until now move with the keyframes before them."""
-        if self.graph.is_used and len(self.graph.nodes):
-            before = TrackedFrame(current.index - 1, current.frame.stamp_ns - 1, self._motion.trusted_pose, np.zeros((6, 6)))
-            self.graph.interrupt(before)
+    def _leave(self, current: CurrentFrame, T_world_cam: Matrix, *, begins: bool = False) -> CurrentFrame:
+        """Notes that the camera is elsewhere than it was last: frames until now move with the keyframes before them.
+
+        Nobody knows the way there. So it is no motion of the odometry, but as if the world had been corrected.
+
+        Args:
+            current: the first frame there.
+            T_world_cam: [4, 4] its pose.
+            begins: True if a new map begins there.
+
+        Returns:
+            The frame.
+        """
+        graph, T_before = self.graph, self._motion.trusted_pose
+        if graph.is_used and len(graph.nodes) and (begins or graph.nodes.frames[-1] >= 0):
+            graph.interrupt(TrackedFrame(current.index - 1, current.frame.stamp_ns - 1, T_before, np.zeros((6, 6))))
+        graph.T_world_odom = T_world_cam @ se3.inverse(T_before) @ graph.T_world_odom
+        return replace(current, T_world_odom=graph.T_world_odom)
 
     def _follow_graph(
         self, current: CurrentFrame, T_world_cam: Matrix, evidence: Evidence | None = None, found_at: int | None = None, *,

@@ -54,7 +54,7 @@ class Slam(SlamLifecycle):
             found = self._relocaliser.recover(self._sight(seen, view, frame.stamp_ns), tracked, verdict)
         if found is not None:
             tracked, verdict = found.result, self._judge.relocate(found.judge, found.verdict)
-            self._leave(current)
+            current = self._leave(current, found.T_world_cam)
             self._motion.place(found.T_world_cam)
         current.clock.lap('track')
         if verdict.status is Status.LOST:

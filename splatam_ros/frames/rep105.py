@@ -42,7 +42,8 @@ class Located:
         T_map_camera: [4, 4] pose of the camera in the map.
         T_map_body: [4, 4] pose of the body in the map.
         T_map_odom: [4, 4] correction of the odometry; None if the odometry is not known at this stamp.
-        T_map_steady: [4, 4] all corrections of the map by loops: poses times its inverse never jump.
+        T_map_steady: [4, 4] all corrections of the map by loops, and jumps of a camera that was found elsewhere: poses times its
+            inverse never jump.
         up_world: [3] upward direction in the core's world, by an Imu at rest; None if it is not known.
     """
 

@@ -44,6 +44,8 @@ def test_a_new_map_starts_and_joins_the_old_one(caplog: pytest.LogCaptureFixture
     assert sum(result.is_relocalised for result in results) == 2  # in each of the maps
     assert slam.graph.num_loops > 0 and slam.graph.num_corrections >= 1
     posed = [(index, result) for index, result in enumerate(results) if result.status.is_trusted]
+    odometry = np.array([se3.inverse(result.T_world_odom) @ result.T_world_cam for _, result in posed])
+    assert np.linalg.norm(np.diff(odometry[:, :3, 3], axis=0), axis=1).max() < 0.3  # the walk's end is 17 cm from its beginning
     stamps_ns, online = (np.array(values) for values in zip(*((result.stamp_ns, result.T_world_cam) for _, result in posed)))
     final = slam.graph.corrected(stamps_ns, online)
     truth = open_sequence('synthetic:motion=fast', width=160).ground_truth().T_world_cam

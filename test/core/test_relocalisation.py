@@ -103,6 +103,8 @@ def test_a_kidnapped_camera_is_found(walk: Walk) -> None:
     for result, true in zip(results[found:], walk.true[found:]):
         assert result.status is Status.TRACKED and off(result, true) < 0.05  # two pixels at the walls' 2.5 m
     assert results[found].covariance is not None and results[found].covariance.drift_position_m > 0
+    odometry = se3.inverse(results[found].T_world_odom) @ results[found].T_world_cam
+    np.testing.assert_allclose(odometry, walk.state.motion.T_world_cam, atol=1e-9)  # nobody knows the way there
 
 
 def test_frames_confirm_a_place_until_the_pose_is_sure(walk: Walk, monkeypatch: pytest.MonkeyPatch) -> None:
