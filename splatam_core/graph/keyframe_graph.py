@@ -38,12 +38,13 @@ from splatam_core.graph.links import (
     size,
 )
 from splatam_core.graph.nodes import Nodes
-from splatam_core.graph.pairs import PairAligner, PairResult
+from splatam_core.graph.pairs import PairAligner, PairResult, Shot
 from splatam_core.graph.places import Places
 from splatam_core.graph.pose_graph import Optimizer, OptimizerState, PoseGraph
 from splatam_core.mapping.keyframes import overlaps, sample_points
 from splatam_core.mapping.posed import PosedView
 from splatam_core.tracking.aligner import Aligner
+from splatam_core.tracking.read_motion import STILL, ReadMotion
 from splatam_core.types import Arrays, GraphSummary
 
 _log = logging.getLogger(__name__)
@@ -84,6 +85,7 @@ class TrackedFrame:
         found_at: number of the keyframe by which a camera that was lost has been found anew, so that the way to here is not known;
             negative if it is no node; None = it was not lost.
         begins: True if a new map begins here, of which nobody knows how it lies to the old one.
+        motion: of the camera while it took the frame.
     """
 
     index: int
@@ -92,6 +94,7 @@ class TrackedFrame:
     covariance: Matrix
     found_at: int | None = None
     begins: bool = False
+    motion: ReadMotion = STILL
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -211,7 +214,7 @@ class KeyframeGraph:
             self.rest()
         is_far, node = frame.found_at is not None or self._is_interrupted, len(self.nodes)
         self._is_interrupted = False
-        self.nodes = self.nodes.added(frame.index, frame.stamp_ns, frame.T_world_cam)
+        self.nodes = self.nodes.added(frame.index, frame.stamp_ns, frame.T_world_cam, frame.motion)
         self._active.append(node)
         if not node or frame.begins or self.nodes.frames[node - 1] < 0:
             return
@@ -342,10 +345,11 @@ class KeyframeGraph:
         views = [by_frame.get(int(self.nodes.frames[node])) for node in (first, second)]
         if views[0] is None or views[1] is None or self._pairs is None:
             return None
-        there = self._pairs.align(views[0].view, views[1].view, T_second_first)
+        shots = [Shot(seen.view, self.nodes.motion(node, max(first, second))) for seen, node in zip(views, (first, second)) if seen]
+        there = self._pairs.align(*shots, T_second_first)
         if there.overlap < _LEAST_OVERLAP or there.agreement < _LEAST_AGREEMENT:
             return None
-        if and_back and not all(np.array(self._pairs.way_back(views[0].view, views[1].view, there)) <= _MAX_BACK):
+        if and_back and not all(np.array(self._pairs.way_back(*shots, there)) <= _MAX_BACK):
             return None
         return there
 
