@@ -342,16 +342,20 @@ class KeyframeGraph:
         self, first: int, second: int, by_frame: dict[int, PosedView], T_second_first: Matrix, *, and_back: bool = False
     ) -> PairResult | None:
         """Aligns the images of two nodes, starting at a motion [4, 4]; returns None if the result is not sure."""
-        views = [by_frame.get(int(self.nodes.frames[node])) for node in (first, second)]
-        if views[0] is None or views[1] is None or self._pairs is None:
+        one, other = self._shot(first, by_frame, max(first, second)), self._shot(second, by_frame, max(first, second))
+        if one is None or other is None or self._pairs is None:
             return None
-        shots = [Shot(seen.view, self.nodes.motion(node, max(first, second))) for seen, node in zip(views, (first, second)) if seen]
-        there = self._pairs.align(*shots, T_second_first)
+        there = self._pairs.align(one, other, T_second_first)
         if there.overlap < _LEAST_OVERLAP or there.agreement < _LEAST_AGREEMENT:
             return None
-        if and_back and not all(np.array(self._pairs.way_back(*shots, there)) <= _MAX_BACK):
+        if and_back and not all(np.array(self._pairs.way_back(one, other, there)) <= _MAX_BACK):
             return None
         return there
+
+    def _shot(self, node: int, by_frame: dict[int, PosedView], as_known_at: int) -> Shot | None:
+        """Returns the images of a node, taken with the readout known at another; None if they are gone."""
+        keyframe = by_frame.get(int(self.nodes.frames[node]))
+        return None if keyframe is None else Shot(keyframe.view, self.nodes.motion(node, as_known_at))
 
     def _solve(self, frame: TrackedFrame) -> Corrections | None:
         """Takes loops that were found into the graph, and optimises it, a few steps a frame.

@@ -59,7 +59,7 @@ class PairAligner:
     def __init__(self, aligner: Aligner[Any], config: TrackingConfig) -> None:
         still = replace(config, align=replace(config.align, time_offset=False))  # it is part of both views
         self._aligner, self._gauss_newton = aligner, GaussNewton(aligner, still)
-        self._pyramids: dict[tuple[View, float], list[Level]] = {}  # by view and readout, ordered by last use
+        self._pyramids: dict[tuple[View, bytes], list[Level]] = {}  # by view and motion, ordered by last use
 
     def align(self, first: Shot, second: Shot, T_second_first: Matrix) -> PairResult:
         """Aligns the second view to the first, starting at a motion [4, 4] from the first one's camera to the second one's.
@@ -84,13 +84,14 @@ class PairAligner:
 
     def _pyramid(self, shot: Shot) -> list[Level]:
         """Returns the pyramid of a view, as if all of it was taken at once."""
-        readout_s = _READOUT_STEP_S * round(shot.motion.readout_s / _READOUT_STEP_S)
-        pyramid = self._pyramids.pop((shot.view, readout_s), None)
+        motion = replace(shot.motion, readout_s=_READOUT_STEP_S * round(shot.motion.readout_s / _READOUT_STEP_S))
+        key = shot.view, motion.rows.tobytes() + motion.delay.tobytes()
+        pyramid = self._pyramids.pop(key, None)
         if pyramid is None:
             finest, *coarser = half_pyramid(frame_level(shot.view, self._aligner), self._aligner)
-            still = unrolled(finest, replace(shot.motion, readout_s=readout_s))
+            still = unrolled(finest, motion)
             pyramid = [finest, *coarser] if still is finest else [still, *half_pyramid(still, self._aligner)][: 1 + len(coarser)]
-        self._pyramids[shot.view, readout_s] = pyramid
+        self._pyramids[key] = pyramid
         while len(self._pyramids) > _KEPT_PYRAMIDS:
             del self._pyramids[next(iter(self._pyramids))]
         return pyramid

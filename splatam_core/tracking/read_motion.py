@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -67,7 +68,7 @@ def unrolled(level: Level, motion: ReadMotion) -> Level:
         at = _projected(_carried(points, motion.rows, _times(at[1], camera)), camera)
     outside = (at[0] < 0) | (at[1] < 0) | (at[0] > camera.width - 1) | (at[1] > camera.height - 1)
     brightness = cv2.remap(np.asarray(level.brightness), *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return replace(level, brightness=brightness, depth=np.where(outside, np.float32(np.nan), depth))
+    return replace(level, brightness=brightness.astype(np.float32, copy=False), depth=np.where(outside, np.float32(np.nan), depth))
 
 
 def _times(rows: Array, camera: PinholeCamera) -> Array:
@@ -100,6 +101,8 @@ def _came_from(moved: Pixels, pixels: Pixels) -> Pixels:
 
 def _sampled_depth(depth: Array, at: Pixels) -> Array:
     """Returns depth at columns and rows: that of the nearest pixel beside NaN and between two surfaces; NaN outside."""
-    outside = {'borderMode': cv2.BORDER_CONSTANT, 'borderValue': np.nan}
-    between, nearest = (cv2.remap(depth, *at, method, **outside) for method in (cv2.INTER_LINEAR, cv2.INTER_NEAREST))
+    between, nearest = (
+        cv2.remap(depth, *at, method, borderMode=cv2.BORDER_CONSTANT, borderValue=math.nan)
+        for method in (cv2.INTER_LINEAR, cv2.INTER_NEAREST)
+    )
     return np.where(np.abs(between - nearest) < EDGE * nearest, between, nearest).astype(np.float32)
