@@ -371,7 +371,10 @@ class SlamLifecycle:
         if not self.graph.is_used or not len(self._mapper.keyframes):
             return
         covariance = np.zeros((6, 6)) if evidence is None else evidence.covariance
-        frame = TrackedFrame(current.index, current.frame.stamp_ns, T_world_cam, covariance, found_at, begins)
+        frame = TrackedFrame(
+            current.index, current.frame.stamp_ns, T_world_cam, covariance,
+            found_at=found_at, begins=begins, motion=self._motion.read_motion,
+        )  # fmt: skip
         try:
             self._correct(self.graph.follow(frame, self._mapper.keyframes, self.places))
         except np.linalg.LinAlgError as error:  # the frame is tracked and mapped: only its edges are missing

@@ -38,12 +38,13 @@ from splatam_core.graph.links import (
     size,
 )
 from splatam_core.graph.nodes import Nodes
-from splatam_core.graph.pairs import PairAligner, PairResult
+from splatam_core.graph.pairs import PairAligner, PairResult, Shot
 from splatam_core.graph.places import Places
 from splatam_core.graph.pose_graph import Optimizer, OptimizerState, PoseGraph
 from splatam_core.mapping.keyframes import overlaps, sample_points
 from splatam_core.mapping.posed import PosedView
 from splatam_core.tracking.aligner import Aligner
+from splatam_core.tracking.read_motion import STILL, ReadMotion
 from splatam_core.types import Arrays, GraphSummary
 
 _log = logging.getLogger(__name__)
@@ -85,6 +86,7 @@ class TrackedFrame:
         found_at: number of the keyframe by which a camera that was lost has been found anew, so that the way to here is not known;
             negative if it is no node; None = it was not lost.
         begins: True if a new map begins here, of which nobody knows how it lies to the old one.
+        motion: of the camera while it took the frame.
     """
 
     index: int
@@ -93,6 +95,7 @@ class TrackedFrame:
     covariance: Matrix
     found_at: int | None = None
     begins: bool = False
+    motion: ReadMotion = STILL
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,7 +226,7 @@ class KeyframeGraph:
             self.rest()
         is_far, node = frame.found_at is not None or self._is_interrupted, len(self.nodes)
         self._is_interrupted = False
-        self.nodes = self.nodes.added(frame.index, frame.stamp_ns, frame.T_world_cam)
+        self.nodes = self.nodes.added(frame.index, frame.stamp_ns, frame.T_world_cam, frame.motion)
         self._active.append(node)
         if not node or frame.begins or self.nodes.frames[node - 1] < 0:
             return
@@ -369,15 +372,20 @@ class KeyframeGraph:
         self, first: int, second: int, by_frame: dict[int, PosedView], T_second_first: Matrix, *, and_back: bool = False
     ) -> PairResult | None:
         """Aligns the images of two nodes, starting at a motion [4, 4]; returns None if the result is not sure."""
-        views = [by_frame.get(int(self.nodes.frames[node])) for node in (first, second)]
-        if views[0] is None or views[1] is None or self._pairs is None:
+        one, other = self._shot(first, by_frame, max(first, second)), self._shot(second, by_frame, max(first, second))
+        if one is None or other is None or self._pairs is None:
             return None
-        there = self._pairs.align(views[0].view, views[1].view, T_second_first)
+        there = self._pairs.align(one, other, T_second_first)
         if there.overlap < _LEAST_OVERLAP or there.agreement < _LEAST_AGREEMENT:
             return None
-        if and_back and not all(np.array(self._pairs.way_back(views[0].view, views[1].view, there)) <= _MAX_BACK):
+        if and_back and not all(np.array(self._pairs.way_back(one, other, there)) <= _MAX_BACK):
             return None
         return there
+
+    def _shot(self, node: int, by_frame: dict[int, PosedView], as_known_at: int) -> Shot | None:
+        """Returns the images of a node, taken with the readout known at another; None if they are gone."""
+        keyframe = by_frame.get(int(self.nodes.frames[node]))
+        return None if keyframe is None else Shot(keyframe.view, self.nodes.motion(node, as_known_at))
 
     def _solve(self, frame: TrackedFrame) -> Corrections | None:
         """Takes loops that were found into the graph, and optimises it, a few steps a frame.

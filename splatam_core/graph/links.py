@@ -14,7 +14,6 @@ from splatam_core.geometry.se3 import Matrix
 from splatam_core.graph.pose_graph import Edge
 
 _FAR_M = 5.0  # of a new map that lies beside the old one: more than drift
-_LIMIT = 60.0  # of the squared error of an edge, in standard deviations of six numbers
 
 
 class Kind(IntEnum):
@@ -27,8 +26,15 @@ class Kind(IntEnum):
     FOUND = 4  # a loop that nobody has compared with the graph yet
 
 
-_DEVIATIONS = {Kind.ODOMETRY: (0.008, 0.004), Kind.WINDOW: (0.01, 0.006), Kind.LOOP: (0.02, 0.012)}
-"""Errors (m, rad) that images do not show, such as those of calibration; from one keyframe to the next, or of a loop."""
+_LIMITS = {Kind.ODOMETRY: np.inf, Kind.WINDOW: 6.0, Kind.LOOP: 60.0}
+"""Of the squared error of an edge, in standard deviations of six numbers. A pair that contradicts the odometry and other pairs is
+wrong; loops may contradict them by all the drift that came together."""
+
+_DEVIATIONS = {Kind.ODOMETRY: (0.016, 0.008), Kind.WINDOW: (0.01, 0.006), Kind.LOOP: (0.02, 0.012)}
+"""Errors (m, rad) that images do not show, such as those of calibration; from one keyframe to the next, or of a loop.
+
+Those of the odometry are alike from one keyframe to the next, because the map gives way to the camera: they add up.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +56,7 @@ class Link(Edge):
             factor: by which the errors of its kind are larger than usual.
         """
         own = np.diag(np.repeat(np.square(factor * np.array(_DEVIATIONS[kind])), 3))
-        return cls(first, second, T, inverse(own + covariance), np.inf if kind is Kind.ODOMETRY else _LIMIT, kind=kind)
+        return cls(first, second, T, inverse(own + covariance), _LIMITS[kind], kind=kind)
 
 
 class Work(IntEnum):

@@ -10,6 +10,7 @@ import numpy as np
 
 from splatam_core.geometry import se3
 from splatam_core.geometry.se3 import Matrix
+from splatam_core.tracking.read_motion import ReadMotion
 from splatam_core.tracking.readout import Readout, ReadoutSeen
 from splatam_core.tracking.time_offset import TimeOffset
 
@@ -151,6 +152,11 @@ class MotionModel:
     def trusted_pose(self) -> Matrix:
         """[4, 4] camera to world, the last one that is not uncertain."""
         return self._T_world_cam if self._trusted_ns is None else self._T_world_cam_trusted
+
+    @property
+    def read_motion(self) -> ReadMotion:
+        """How the camera moved while it took the last frame, as far as its velocity is known."""
+        return ReadMotion(-self._velocity, self.readout.used_s, 1e-9 * self._interval_ns * self.time_offset.mean)
 
     def state(self) -> MotionState:
         """Returns the state, for ``restore``."""

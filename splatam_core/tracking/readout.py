@@ -44,16 +44,17 @@ class Readout:
     deviation: float = 0.0
     inflation: float = _FIRST_INFLATION
 
-    def prior(self, interval_s: float) -> ReadoutSeen | None:
-        """Returns what is known before a frame, so much later than the last one; None where that is not known.
+    @property
+    def used_s(self) -> float:
+        """The time, less where it is hardly larger than its error (James and Stein 1961), so that noise is not used."""
+        return self.seconds * max(0.0, 1 - (self.deviation / self.seconds) ** 2) if self.seconds else 0.0
 
-        The mean is less where it is hardly larger than its error (James and Stein 1961), so that noise is not used.
-        """
+    def prior(self, interval_s: float) -> ReadoutSeen | None:
+        """Returns what is known before a frame, so much later than the last one; None where that is not known."""
         if not 0 < interval_s < math.inf:
             return None
         deviation = self.deviation or _FIRST_DEVIATION * interval_s
-        used = self.seconds * max(0.0, 1 - (deviation / self.seconds) ** 2) if self.seconds else 0.0
-        return ReadoutSeen(min(max(used / interval_s, -1.0), 1.0), self.inflation * (interval_s / deviation) ** 2)
+        return ReadoutSeen(min(max(self.used_s / interval_s, -1.0), 1.0), self.inflation * (interval_s / deviation) ** 2)
 
     def updated(self, seen: ReadoutSeen, interval_s: float) -> Readout:
         """Returns the estimate after one frame."""
