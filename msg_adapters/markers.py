@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from msg_adapters import stamps
 from msg_adapters.factory import MessageFactory
 
-SPHERE_LIST, LINE_LIST, ADD = 7, 5, 0
+SPHERE_LIST, LINE_LIST, ADD, DELETE = 7, 5, 0, 2
 NODE_M, LINE_M, LOOP_M = 0.03, 0.005, 0.015
 NODE_COLOR, EDGE_COLOR, LOOP_COLOR = (0.2, 0.6, 1.0), (0.6, 0.6, 0.6), (1.0, 0.3, 0.1)
 
@@ -49,7 +49,7 @@ def _marker(
         ns=name,
         id=0,
         type=kind,
-        action=ADD,
+        action=ADD if len(points) else DELETE,  # RViz warns of markers without points
         pose=factory.make(
             'geometry_msgs/msg/Pose', position=factory.make('geometry_msgs/msg/Point', x=0.0, y=0.0, z=0.0), orientation=still
         ),

@@ -116,6 +116,7 @@ class Output:
         message: makes the message.
         help: one line for the documentation.
         rate_hz: returns the largest number of messages per second, 0 = no limit.
+        nothing: makes the message that takes back what was published of a map that is gone; None = there is none.
     """
 
     topic: str
@@ -125,6 +126,7 @@ class Output:
     message: Callable[[PublishContext], Any]
     help: str
     rate_hz: Callable[[NodeOptions], float] = _no_limit
+    nothing: Callable[[PublishContext], Any] | None = None
 
 
 def _pose(context: PublishContext) -> Any:
@@ -147,6 +149,15 @@ def _pose_with_covariance(context: PublishContext) -> Any:
 
 def _path(context: PublishContext) -> Any:
     return poses.path(context.factory, context.path.poses(context), context.stamp_ns, context.map_frame)
+
+
+def _no_path(context: PublishContext) -> Any:
+    return poses.path(context.factory, [], context.stamp_ns, context.map_frame)
+
+
+def _no_graph(context: PublishContext) -> Any:
+    none = np.empty((0, 2), np.intp)
+    return markers.graph(context.factory, np.empty((0, 3)), none, none, stamp_ns=context.stamp_ns, frame_id=context.map_frame)
 
 
 def _graph(context: PublishContext) -> Any:
@@ -213,9 +224,10 @@ OUTPUTS = (
            'pose of the base (of the camera, if there is no base) in the map, with velocity and covariances; see below'),
     Output('path', 'nav_msgs/msg/Path', LATCHED_QOS, Trigger.SUBSCRIBED, _path,
            'all tracked poses so far as corrected by loops, thinned out evenly beyond `max_path_poses`; latched',
-           rate_hz=_path_rate),
+           rate_hz=_path_rate, nothing=_no_path),
     Output('graph', 'visualization_msgs/msg/MarkerArray', LATCHED_QOS, Trigger.SUBSCRIBED, _graph,
-           'keyframes, the edges between them, and loops: places that were recognised; latched', rate_hz=_path_rate),
+           'keyframes, the edges between them, and loops: places that were recognised; latched', rate_hz=_path_rate,
+           nothing=_no_graph),
     Output('render/rgb', 'sensor_msgs/msg/Image', IMAGE_QOS, Trigger.SUBSCRIBED, _rgb,
            'the map rendered from the pose of the camera', rate_hz=_render_rate),
     Output('render/depth', 'sensor_msgs/msg/Image', IMAGE_QOS, Trigger.SUBSCRIBED, _depth,
@@ -316,6 +328,7 @@ class Outputs:
             ViewerError: the viewer is wanted, and not installed.
         """
         self.num_poses = 0
+        self._newest: PublishContext | None = None
         self._node = node
         self._options = options
         self._frames = frames
@@ -333,10 +346,14 @@ class Outputs:
         self._options = options
 
     def begin_map(self) -> None:
-        """Start a new map: drop the path, the velocity and what late subscribers would be sent."""
+        """Start a new map: drop the path, the velocity and what late subscribers would be sent; take back path and graph."""
+        if self._newest is not None and self._node.context.ok():
+            for output, publisher in self._publishers:
+                if output.nothing is not None and output.topic in self._due_s:
+                    publisher.publish(output.nothing(self._newest))
         self._path = PathHistory(self._options.max_path_poses)
         self._motion = MotionEstimator(self._options.stddev_position, self._options.stddev_orientation)
-        self._newest: PublishContext | None = None
+        self._newest = None
         self._due_s: dict[str, float] = {}
         self._published_ns: dict[str, int] = {}
         self._frames.begin_map()

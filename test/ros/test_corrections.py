@@ -140,6 +140,8 @@ def test_a_graph_is_three_markers() -> None:
     assert [len(marker.points) for marker in message.markers] == [3, 4, 2]
     assert [point.x for point in message.markers[2].points] == [0.0, 2.0]
     assert {marker.header.frame_id for marker in message.markers} == {'map'}
+    alone = markers.graph(RclpyMessages(), centres[:1], edges[:0], loops[:0], stamp_ns=5, frame_id='map')
+    assert [marker.action for marker in alone.markers] == [0, 2, 2]  # what is empty is deleted
 
 
 CLOSING_LOOPS = {

@@ -333,6 +333,9 @@ def test_what_costs_is_made_for_listeners_only_and_at_its_rate(
     assert outputs.has_late_subscriber
     outputs.serve_late_subscribers(slam)
     assert slam.snapshots == 4 + 25 + 1
+    assert heard['path'][-1].poses
+    outputs.begin_map()
+    graph.spin_until(lambda: not heard['path'][-1].poses)  # that of the old map is taken back
 
 
 def check_cloud(cloud: PointCloud2, count: int) -> None:
