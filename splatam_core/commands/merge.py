@@ -24,6 +24,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def merge(args: argparse.Namespace) -> int:
     """Joins the maps of two runs."""
+    from splatam_core.geometry import se3
     from splatam_core.maps.joining import find_joint, joined
     from splatam_core.rasterizer import rasterizer_for
     from splatam_core.runs.layout import check_is_free
@@ -38,9 +39,14 @@ def merge(args: argparse.Namespace) -> int:
     config = first.config
     rasterizer, device = rasterizer_for(config)
     tracker = make_tracker(rasterizer, config.tracking, config.threads, device)
-    there = replace(first_map, gaussians=first_map.gaussians.to(device))
-    joint = find_joint(there, second_map, tracker, config, progress('looking for A in B', 'keyframe'))
+    there = [replace(one, gaussians=one.gaussians.to(device)) for one in (first_map, second_map)]
+    joint = find_joint(there[0], second_map, tracker, config, progress('looking for A in B', 'keyframe'))
     T_first_second = joint.T_first_second
+    if T_first_second is None:  # what the first run saw for a moment may be seen well by the second one
+        back = find_joint(there[1], first_map, tracker, config, progress('looking for B in A', 'keyframe'))
+        if back.T_first_second is not None:
+            joint = replace(back, T_first_second=se3.inverse(back.T_first_second))
+            T_first_second = joint.T_first_second
     if T_first_second is None:
         raise MergeError(_why_not_joined(joint, args))
     slam, both = Slam(config), joined(first_map, second_map, T_first_second)

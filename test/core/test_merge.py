@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from splatam_core.config import load_config
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.geometry import se3
 from splatam_core.geometry.trajectory import interpolate_poses
-from splatam_core.maps.joining import SavedMap, find_joint, joined, transformed
+from splatam_core.maps.joining import Joint, SavedMap, find_joint, joined, transformed
 from splatam_core.maps.ply import read_ply, write_ply
 from splatam_core.rasterizer import make_rasterizer
 from splatam_core.runs.map_keyframes import read_map_keyframes
@@ -94,6 +95,23 @@ def test_a_camera_finds_itself_in_the_merged_map(merged: Path) -> None:
     slam.load(one.gaussians, None, one.saved)
     results = [slam.process(frames[index]) for index in (5, 6, START + FRAMES - 4, START + FRAMES - 3)]
     assert results[1].status is Status.TRACKED
+
+
+def test_it_does_not_matter_which_run_sees_the_other(
+    runs: tuple[Path, Path], merged: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where no keyframe of the second is recognised in the first, those of the first are looked for in the second."""
+    calls: list[int] = []
+
+    def seen_from_one_side(first: SavedMap, second: SavedMap, *rest: object) -> Joint:
+        calls.append(len(first.gaussians))
+        return find_joint(first, second, *rest) if len(calls) == 2 else Joint(None, 1, 0, 0)  # type: ignore[arg-type]
+
+    monkeypatch.setattr('splatam_core.maps.joining.find_joint', seen_from_one_side)
+    assert splatam('merge', *runs, '--out', tmp_path / 'out') == 0
+    assert calls == [len(saved_map(folder).gaussians) for folder in runs]
+    transforms = [json.loads((folder / 'run.json').read_text())['T_first_second'] for folder in (merged, tmp_path / 'out')]
+    np.testing.assert_allclose(*transforms, atol=0.03)  # m: maps of 160 pixels
 
 
 def test_a_run_that_was_merged_is_not_merged_again(
