@@ -105,8 +105,8 @@ class FrameResult:
         covariance: of the pose; None if the frame is lost or the tracker estimates none.
         num_held: number of directions (of six) that the images did not determine, in which the pose is the predicted one.
         is_relocalised: True if the camera was found anew in the map: its pose does not follow from the frame before.
-        T_world_odom: [4, 4] all corrections of the world before this frame, and the unknown ways of a camera that was found elsewhere:
-            its pose is this times one that never jumps.
+        T_world_odom: [4, 4] all corrections of the world before this frame, and the unknown ways of a camera that was found
+            elsewhere: its pose is this times one that never jumps.
     """
 
     index: int
