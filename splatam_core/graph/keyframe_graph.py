@@ -375,6 +375,7 @@ class KeyframeGraph:
         one, other = self._shot(first, by_frame, max(first, second)), self._shot(second, by_frame, max(first, second))
         if one is None or other is None or self._pairs is None:
             return None
+        one = replace(one, view=one.view.through(other.view.camera))  # those of a map that was loaded may be of another camera
         there = self._pairs.align(one, other, T_second_first)
         if there.overlap < _LEAST_OVERLAP or there.agreement < _LEAST_AGREEMENT:
             return None

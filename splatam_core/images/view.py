@@ -91,6 +91,19 @@ class View:
         depth = torch.where(depth > 0, depth, nearest(self.depth, *size).clamp(max=0))
         return View(camera, rgb8, depth, spacing_of_grid(readings > 0))
 
+    def through(self, camera: PinholeCamera) -> View:
+        """Returns the view as another pinhole at the same place would show it; nothing is compared where this one does not look."""
+        if camera == self.camera:
+            return self
+        own = self.scaled(min(1.0, camera.fx / self.camera.fx))
+        to_own = own.camera.matrix @ np.linalg.inv(camera.matrix)
+        u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+        x, y = (to_own[axis, axis] * pixels + to_own[axis, 2] for axis, pixels in enumerate((u, v)))
+        maps, device = (x.astype(np.float32), y.astype(np.float32)), self.depth.device
+        rgb8 = cv2.remap(own.rgb8.numpy(force=True), *maps, cv2.INTER_LINEAR)
+        depth = cv2.remap(own.depth.numpy(force=True), *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=-1.0)
+        return View(camera, torch.from_numpy(rgb8).to(device), torch.from_numpy(depth).to(device), own.spacing)
+
     def narrowed(self, scale: float, max_width: int) -> View:
         """Returns the view resized by ``narrowing``."""
         return self.scaled(narrowing(self.camera.width, scale, max_width))

@@ -13,6 +13,7 @@ from splatam_core.datasets.registry import open_sequence
 from splatam_core.errors import FrameError
 from splatam_core.geometry import se3
 from splatam_core.slam import Slam
+from splatam_core.state import NO_KEYFRAMES, SavedKeyframes
 from splatam_core.types import FrameResult, RgbdFrame, Status
 
 OVERRIDES = ('threads=1', 'keyframes.every=2', 'mapping.iterations=3', 'graph.loop_after=8', 'graph.min_correction_m=0')
@@ -79,6 +80,20 @@ def test_without_a_graph_nothing_is_kept(there_and_back: list[RgbdFrame]) -> Non
     assert slam.graph.summary.nodes == 0 and slam.optimize_graph() == 0
     poses = np.array([result.T_world_cam for result in results])
     assert (slam.graph.corrected(np.array([result.stamp_ns for result in results]), poses) == poses).all()
+
+
+def test_keyframes_of_another_camera_close_loops(there_and_back: list[RgbdFrame]) -> None:
+    """A map that was made with wider images is loaded: its keyframes and the new ones are compared."""
+    before = slam_with('graph.enabled=true')
+    sequence = open_sequence('synthetic', width=144, max_frames=11)
+    for index in range(0, 11, 2):
+        before.process(sequence[index])
+    numbered = [replace(keyframe, frame=index - len(before.keyframes)) for index, keyframe in enumerate(before.keyframes)]
+    slam = slam_with('graph.enabled=true', 'graph.loop_after=1')
+    slam.load(before.map.gaussians.detached(), np.eye(4), SavedKeyframes(tuple(numbered), NO_KEYFRAMES.places))
+    assert all(slam.process(frame).status.is_trusted for frame in there_and_back[:11])
+    slam.optimize_graph()
+    assert (slam.graph.pairs(loops=True)[:, 0] < len(numbered)).any()
 
 
 def test_it_can_be_switched_on_and_off_between_frames(there_and_back: list[RgbdFrame]) -> None:
