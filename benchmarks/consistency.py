@@ -1,21 +1,30 @@
 """How consistent a map is where the camera comes back: online and final trajectory, loops, and what the graph costs.
 
     python benchmarks/consistency.py [RECORDING ...] [--preset realtime] [--width 320] [--runs 1] [--data DIR] [--set KEY=VALUE]
+        [--cost]
 
 RECORDING is a folder in DIR, FOLDER:START:END for some of its frames, ``corridor:N`` for N synthetic frames along the wall of
-growth.py and N back, or ``ring:N`` for once around the ring of ring.py in N frames and a tenth of it again. Run k has seed k and
-one thread. A loop is false if it differs from the ground truth by more than 8 cm. `graph` is the time in the graph, as a share of
-the whole; `slowest` the longest of a frame. `PSNR` is that of the final map at the final poses, every 10th frame; `again` that of
-the frames that see a synthetic place for the second time.
+growth.py and N back, ``wall:N`` for the way there alone, or ``ring:N`` for once around the ring of ring.py in N frames and a
+tenth of it again. Run k has seed k and one thread. A loop is false if it differs from the ground truth by more than 8 cm. `graph`
+is the time in the graph, as a share of the whole; `slowest` the longest of a frame. `PSNR` is that of the final map at the final
+poses, every 10th frame; `again` that of the frames that see a synthetic place for the second time.
+
+With --cost the same frames go through a SLAM without and one with the graph, in turn, and the processor time of both is compared,
+so that other work on the machine hardly counts: `more` is what the graph adds; `growth` the time of the last hundred frames
+relative to frames 200 to 299; `part` the graph's time in a frame: mean, that of 99 in 100, and the longest; `ms per loop` what is
+not spent on keyframes that follow each other, by the number of loops; `kB` what the graph and the places hold of a keyframe,
+beside its images.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import growth
 import numpy as np
@@ -23,7 +32,7 @@ import ring
 from header import print_header
 from numpy.typing import NDArray
 
-from splatam_core.config import apply_threads, load_config
+from splatam_core.config import SlamConfig, apply_threads, load_config
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.evaluation.trajectory import trajectory_error
 from splatam_core.geometry import se3
@@ -36,6 +45,11 @@ COLUMNS = (
     'recording', 'seed', 'frames', 'uncertain', 'lost', 'ATE cm online', 'final', 'end cm online', 'final', 'loops', 'false',
     'corrections', 'ms per frame', 'graph %', 'slowest ms', 'Gaussians', 'PSNR dB', 'again',
 )  # fmt: skip
+COST_COLUMNS = (
+    'recording', 'seed', 'frames', 'CPU ms without', 'with', 'more', 'growth without', 'with', 'part ms', 'of 99', 'longest',
+    'loops', 'corrections', 'ms per loop', 'kB',
+)  # fmt: skip
+KEY_BYTES = 16  # of a feature, beside what a checkpoint holds
 FALSE_M = 0.08
 
 
@@ -62,7 +76,7 @@ class Recording:
 def opened(name: str, args: argparse.Namespace) -> Recording:
     """Opens a recording, or makes a synthetic one."""
     folder, *limits = name.split(':')
-    if folder in ('corridor', 'ring'):
+    if folder in ('corridor', 'ring', 'wall'):
         return synthetic(folder, int(limits[0]), args.width)
     start, end = (int(limits[0]), int(limits[1])) if limits else (0, None)
     max_frames = None if end is None else end - start
@@ -74,9 +88,11 @@ def opened(name: str, args: argparse.Namespace) -> Recording:
 
 
 def synthetic(kind: str, count: int, width: int) -> Recording:
-    """Makes the corridor, there and back, or the ring. Each frame has noise of its own, the same every time."""
+    """Makes the corridor, there and back or there only, or the ring. Each frame has noise of its own, the same every time."""
     cam = growth.camera(width)
-    if kind == 'corridor':
+    if kind == 'wall':
+        poses, again_from = [growth.pose(place) for place in range(count)], count
+    elif kind == 'corridor':
         poses, again_from = [growth.pose(place) for place in (*range(count), *reversed(range(count)))], count
     else:
         poses, again_from = [ring.pose(place, count) for place in range(count + count // 10)], count
@@ -84,7 +100,7 @@ def synthetic(kind: str, count: int, width: int) -> Recording:
 
     def frame(index: int) -> RgbdFrame:
         T, stamp_ns, rng = poses[index], int(stamps_ns[index]), np.random.default_rng(index)
-        return growth.frame_at(T, stamp_ns, cam, rng) if kind == 'corridor' else ring.frame_at(T, stamp_ns, count, cam, rng)
+        return ring.frame_at(T, stamp_ns, count, cam, rng) if kind == 'ring' else growth.frame_at(T, stamp_ns, cam, rng)
 
     return Recording(len(poses), frame, Trajectory(stamps_ns, np.array(poses)), again_from)
 
@@ -108,6 +124,72 @@ def row(name: str, seed: int, args: argparse.Namespace) -> str:
         *(f'{100 * error.rmse_m:.2f}' for error in errors), *(f'{100 * end:.1f}' for end in ends), len(loops),
         int((loops > FALSE_M).sum()), slam.graph.num_corrections, f'{total.mean():.1f}', f'{100 * graph.sum() / total.sum():.1f}',
         f'{graph.max():.0f}', slam.num_gaussians, *psnr_db(slam, recording, final),
+    ]  # fmt: skip
+    return '| ' + ' | '.join(map(str, cells)) + ' |'
+
+
+def time_method(owner: object, name: str, taken_ms: list[float]) -> None:
+    """Appends to a list what each call of a method takes from now on."""
+    function = getattr(owner, name)
+
+    def timed(*arguments: Any, **options: Any) -> Any:
+        start = time.process_time()
+        try:
+            return function(*arguments, **options)
+        finally:
+            taken_ms.append(1e3 * (time.process_time() - start))
+
+    vars(owner)[name] = timed
+
+
+class Timed:
+    """A SLAM whose processor time is taken.
+
+    Attributes:
+        slam: it.
+        frames_ms: of each frame.
+        graph_ms: of the graph, in each tracked frame, with the correction of the map.
+        joins_ms: of each alignment of keyframes that follow each other, part of that.
+    """
+
+    def __init__(self, config: SlamConfig, length: int) -> None:
+        self.slam, self.frames_ms = Slam(config, num_frames=length), list[float]()
+        self.graph_ms, self.joins_ms = list[float](), list[float]()
+        time_method(self.slam, '_follow_graph', self.graph_ms)
+        time_method(self.slam.graph, '_join', self.joins_ms)
+
+    def process(self, frame: RgbdFrame) -> None:
+        """Processes a frame."""
+        start = time.process_time()
+        self.slam.process(frame)
+        self.frames_ms.append(1e3 * (time.process_time() - start))
+
+    @property
+    def growth(self) -> str:
+        """How much longer a frame takes at the end than at the beginning; nothing where there are too few."""
+        return f'{np.mean(self.frames_ms[-100:]) / np.mean(self.frames_ms[200:300]):.2f}' if len(self.frames_ms) >= 500 else ''
+
+
+def cost_row(name: str, seed: int, args: argparse.Namespace) -> str:
+    """Runs the preset with and without the graph, frame by frame in turn. Returns a line of the table."""
+    recording = opened(name, args)
+    overrides = ['threads=1', f'seed={seed}', *args.overrides]
+    configs = [load_config(args.preset, [*overrides, f'graph.enabled={on}']) for on in ('false', 'true')]
+    apply_threads(configs[0])
+    both = plain, graphed = [Timed(config, recording.length) for config in configs]
+    for index in range(recording.length):
+        frame = recording.frame(index)
+        for timed in both:
+            timed.process(frame)
+    graph, frames_ms = np.array(graphed.graph_ms), [np.mean(timed.frames_ms) for timed in both]
+    slam = graphed.slam
+    arrays = [*slam.graph.arrays().values(), *slam.places.arrays().values()]
+    kept = sum(array.nbytes for array in arrays) + KEY_BYTES * len(slam.places.arrays()['points'])
+    loops, for_loops_ms = slam.graph.num_loops, graph.sum() - sum(graphed.joins_ms)
+    cells = [
+        name, seed, recording.length, *(f'{ms:.1f}' for ms in frames_ms), f'{100 * (frames_ms[1] / frames_ms[0] - 1):.1f} %',
+        plain.growth, graphed.growth, *(f'{ms:.1f}' for ms in (graph.mean(), np.percentile(graph, 99), graph.max())), loops,
+        slam.graph.num_corrections, f'{for_loops_ms / loops:.0f}' if loops else '', f'{1e-3 * kept / len(slam.keyframes):.0f}',
     ]  # fmt: skip
     return '| ' + ' | '.join(map(str, cells)) + ' |'
 
@@ -157,12 +239,14 @@ def main() -> None:
     parser.add_argument('--runs', type=int, default=1)
     parser.add_argument('--data', type=Path, default=Path(os.environ.get('SPLATAM_DATA', '../shared/data')))
     parser.add_argument('--set', dest='overrides', action='append', default=[], metavar='KEY=VALUE')
+    parser.add_argument('--cost', action='store_true', help='compare the processor time with that without the graph')
     args = parser.parse_args()
     print_header(f'Preset `{args.preset}`, width {args.width}, one thread', args.runs)
-    print('| ' + ' | '.join(COLUMNS) + ' |\n|' + '---|' * len(COLUMNS))
+    columns, make_row = (COST_COLUMNS, cost_row) if args.cost else (COLUMNS, row)
+    print('| ' + ' | '.join(columns) + ' |\n|' + '---|' * len(columns))
     for name in args.recordings:
         for seed in range(args.runs):
-            print(row(name, seed, args), flush=True)
+            print(make_row(name, seed, args), flush=True)
 
 
 if __name__ == '__main__':

@@ -448,7 +448,7 @@ class SlamLifecycle:
 
     def _new_graph_aligner(self) -> Aligner[Any] | None:
         """Returns what aligns keyframes, which are in the host's memory; None if there is no graph."""
-        if not self.config.graph.enabled:
+        if not self.config.graph.enabled or self.config.tracking.method == 'truth':  # true poses need no correction
             return None
         try:
             return make_aligner(self.config.threads, HOST)

@@ -24,7 +24,6 @@ from splatam_core.geometry import motions, se3
 from splatam_core.geometry.se3 import Matrix
 from splatam_core.graph.corrections import Corrections
 from splatam_core.graph.links import (
-    COST,
     Kind,
     Link,
     Task,
@@ -41,6 +40,7 @@ from splatam_core.graph.nodes import Nodes
 from splatam_core.graph.pairs import PairAligner, PairResult, Shot
 from splatam_core.graph.places import Places
 from splatam_core.graph.pose_graph import Optimizer, OptimizerState, PoseGraph
+from splatam_core.graph.schedule import GraphSchedule
 from splatam_core.mapping.keyframes import overlaps, sample_points
 from splatam_core.mapping.posed import PosedView
 from splatam_core.tracking.aligner import Aligner
@@ -58,20 +58,21 @@ _MAX_BACK = 0.02, 0.015  # m, rad: there and back
 _LEAST_OVERLAP, _LEAST_AGREEMENT = 0.3, 0.9
 _MAX_SURPRISE = 0.05  # m and rad: a pair in the window that is farther from the odometry is wrong
 _CANDIDATES = 2  # places compared per keyframe
-_LOOK_EVERYWHERE = 2  # keyframes from one search by features to the next, where no place is found near the camera
+_LOOKS_ALIKE = 4  # places whose features are compared with those of a keyframe
 _LEAST_EXPLAINED = 0.6  # of the view, by a loop
 _SAME = 0.03, 0.1  # m and rad: loops that correct alike differ by less than half of the correction, within these limits
 _GAP_TO_FOUND = 10.0  # keyframes: to a place that was recognised the map says how it lies, with all drift since it was seen
 _SAMPLES = 200
 _MARGIN = 0.03  # of the width
-_WORK_PER_KEYFRAME = 10  # alignments: a little more than a keyframe needs
-_MOST_TASKS = 40  # beyond it, places are not looked for by features
-_STEPS_PER_FRAME = 2  # of the optimisation
+_TASKS_PER_KEYFRAME = 5  # about what a keyframe needs
+_MOST_TASKS = 6  # that wait; beyond it, places near the camera are not compared
+_NODES_PER_FRAME, _MOST_STEPS = 150, 4  # of an optimisation: so many nodes are moved by a step, or less; at most so many steps
 _MOST_LOOPS = 10  # of a keyframe that takes over those of another one: a place seen for hours has no more than one seen twice
 
 _NO_POSES = np.empty((0, 4, 4))
+_TASK_ARRAYS = 'tasks', 'task_motions', 'task_covariances'
 _LINK_ARRAYS = 'T_first_second', 'information', 'limits', 'kinds'
-_SINGLE_ARRAYS = 'T_world_odom', 'num_corrections', 'last_correction_m', 'is_interrupted', 'solving', 'solving_widths'
+_SINGLE_ARRAYS = 'T_world_odom', 'num_corrections', 'last_correction_m', 'is_interrupted', 'solving', 'solving_widths', 'schedule'
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,8 +128,10 @@ class KeyframeGraph:
     nodes: Nodes
     _active: list[int]  # numbers of the nodes that edges connect
     _links: list[Link]
+    _found: list[Link]  # loops that nobody has compared with the graph yet
     _tasks: list[Task]  # what is still to be measured
     _solving: _Solving | None  # the optimisation that goes on
+    _schedule: GraphSchedule  # when loops are looked for
     _is_interrupted: bool  # frames were left out before the next one
 
     def __init__(self, config: SlamConfig, aligner: Aligner[Any] | None) -> None:
@@ -153,7 +156,7 @@ class KeyframeGraph:
         """
         self._aligner = aligner or self._aligner
         self._config, self._seed, self._every = config.graph, config.seed, config.keyframes.every
-        self._work_per_frame = -(-_WORK_PER_KEYFRAME // self._every)
+        self._tasks_per_frame = -(-_TASKS_PER_KEYFRAME // self._every)
         self._pairs = PairAligner(self._aligner, config.tracking) if self._aligner is not None else None
 
     @property
@@ -209,22 +212,31 @@ class KeyframeGraph:
         Returns:
             How poses and map are to be corrected; None if they are to stay.
         """
-        by_frame = {keyframe.frame: keyframe for keyframe in keyframes}
-        if frame.index in by_frame:
+        is_keyframe = bool(keyframes) and keyframes[-1].frame == frame.index
+        by_frame = {keyframe.frame: keyframe for keyframe in keyframes} if is_keyframe or self._tasks else {}
+        if is_keyframe:
             self._add(frame)
             if self._solving is None:
+                self._accept()
                 self._take_out_dropped(by_frame)
             self._plan(len(self.nodes) - 1, by_frame)
         elif frame.found_at is not None or self._is_interrupted:
             self._add(frame)
-        self._measure(by_frame, places)
-        return self._solve(frame)
+        is_to_solve = self._is_time_to_solve(frame.index)
+        self._measure(by_frame, places, self._tasks_per_frame - is_to_solve)
+        if is_to_solve:
+            return self._solve(frame)
+        if self._solving is None:
+            self._accept()
+        return None
 
     def _add(self, frame: TrackedFrame) -> None:
         """Adds a node, and joins it to the one before."""
         if len(self.nodes) and frame.stamp_ns <= self.nodes.stamps_ns[-1]:
             self.rest()
         is_far, node = frame.found_at is not None or self._is_interrupted, len(self.nodes)
+        if is_far or frame.begins:
+            self._schedule = GraphSchedule(is_apart=frame.begins or self._schedule.is_apart)
         self._is_interrupted = False
         self.nodes = self.nodes.added(frame.index, frame.stamp_ns, frame.T_world_cam, frame.motion)
         self._active.append(node)
@@ -243,6 +255,9 @@ class KeyframeGraph:
 
         Those at which the camera was lost, or found elsewhere, stay: what is beside them moves with them.
         """
+        frames = self.nodes.frames[self._active].tolist()
+        if all(frame in by_frame for frame in frames[1:-1]):
+            return
         ways = {(link.first, link.second) for link in self._links if link.kind is Kind.ODOMETRY}
         for before, node, after in list(zip(self._active, self._active[1:], self._active[2:])):
             if int(self.nodes.frames[node]) not in by_frame and {(before, node), (node, after)} <= ways:
@@ -274,30 +289,33 @@ class KeyframeGraph:
 
     def _plan(self, node: int, by_frame: dict[int, PosedView]) -> None:
         """Queues what is to be measured about a new keyframe."""
-        if len(self._tasks) > _MOST_TASKS:
-            self._tasks = [task for task in self._tasks if task.work not in (Work.LOOK, Work.COMPARE)]
+        frame = int(self.nodes.frames[node])
         for before in [self._active[-1 - gap] for gap in WINDOW if gap < len(self._active)]:
             self._queue(Work.JOIN, before, node)
-        if self._old(node, by_frame):
-            for old in self._nearby(node, by_frame):
-                self._queue(Work.CLOSE, old, node)
-            if int(self.nodes.frames[node]) // self._every % _LOOK_EVERYWHERE == 0:
+        is_near_due, room = frame >= self._schedule.near_from, max(0, _MOST_TASKS - len(self._tasks)) // 2  # there and back
+        if (is_near_due or self._schedule.is_apart) and (old := self._old(node, by_frame)):
+            for place in self._nearby(node, old, by_frame)[:room] if is_near_due and room else ():
+                self._queue(Work.CLOSE, place, node)
+            if frame >= self._schedule.anywhere_from and room:
                 self._queue(Work.LOOK, node, node)
+                self._schedule = self._schedule.looked(frame, self._every)
+        self._tasks.sort(key=lambda task: task.work is not Work.JOIN)  # what holds keyframes together comes first
 
     def _queue(self, work: Work, first: int, second: int) -> None:
         T = self.nodes.T_world_cam
         self._tasks.append(Task(work, first, second, motions.between(T[second], T[first])))
 
-    def _measure(self, by_frame: dict[int, PosedView], places: Places | None) -> None:
+    def _measure(self, by_frame: dict[int, PosedView], places: Places | None, most_tasks: int) -> None:
         """Does as much of the work that waits as a frame has time for."""
-        left = self._work_per_frame
-        while self._tasks and (left >= COST[self._tasks[0].work] or left == self._work_per_frame):
+        while most_tasks > 0 and self._tasks:
             task = self._tasks.pop(0)
-            left -= COST[task.work]
+            most_tasks -= task.work is not Work.LOOK  # which takes little
             if task.work is Work.JOIN:
                 self._join(task, by_frame)
             elif task.work is Work.CLOSE:
                 self._find_loop(task, by_frame)
+            elif task.work is Work.RETURN:
+                self._return(task, by_frame)
             elif places is not None and task.work is Work.LOOK:
                 self._look(task.second, by_frame, places)
             elif places is not None:
@@ -315,14 +333,14 @@ class KeyframeGraph:
 
     def _old(self, node: int, by_frame: dict[int, PosedView]) -> list[int]:
         """Returns the nodes of places that were mapped long ago."""
-        frames = self.nodes.frames
-        return [n for n in self._active if frames[n] in by_frame and frames[n] <= frames[node] - self._config.loop_after]
+        frames, latest = self.nodes.frames[self._active].tolist(), int(self.nodes.frames[node]) - self._config.loop_after
+        return [n for n, frame in zip(self._active, frames) if frame <= latest and frame in by_frame]
 
-    def _nearby(self, node: int, by_frame: dict[int, PosedView]) -> list[int]:
-        """Returns the nodes of places mapped long ago that see most of what is seen from where the camera seems to be."""
-        old, now = self._old(node, by_frame), by_frame[int(self.nodes.frames[node])]
+    def _nearby(self, node: int, old: list[int], by_frame: dict[int, PosedView]) -> list[int]:
+        """Returns the old nodes that see most of what is seen from where the camera seems to be."""
+        now = by_frame[int(self.nodes.frames[node])]
         points = sample_points(now, _SAMPLES, np.random.default_rng([self._seed, now.frame]))
-        keyframes = [by_frame[int(self.nodes.frames[n])] for n in old]
+        keyframes = [by_frame[frame] for frame in self.nodes.frames[old].tolist()]
         seen = np.array(overlaps(points, now.view.camera, keyframes, round(_MARGIN * now.view.camera.width)))
         return [old[index] for index in np.argsort(-seen, kind='stable')[:_CANDIDATES] if seen[index] >= _LEAST_OVERLAP]
 
@@ -331,15 +349,14 @@ class KeyframeGraph:
 
         Otherwise with those of maps that lie beside this one until a place of both is recognised.
         """
-        keyframe, old = by_frame.get(int(self.nodes.frames[node])), self._old(node, by_frame)
-        if any(link.second == node and link.kind not in (Kind.ODOMETRY, Kind.WINDOW) for link in self._links):
+        frame, old, tracks = int(self.nodes.frames[node]), self._old(node, by_frame), (Kind.ODOMETRY, Kind.WINDOW)
+        if any(link.second == node and link.kind not in tracks for link in (*self._links, *self._found)):
             old = self._elsewhere(node, old)
-        if keyframe is None or not old:
+        if not old or frame not in by_frame or frame not in places:
             return
-        number = {int(self.nodes.frames[n]): n for n in old}
-        for frame in places.candidates(keyframe.view, [frame for frame in by_frame if frame not in number]):
-            if frame in number:
-                self._queue(Work.COMPARE, number[frame], node)
+        number = dict(zip(self.nodes.frames[old].tolist(), old))
+        for place in places.alike(frame, list(number), _LOOKS_ALIKE):
+            self._queue(Work.COMPARE, number[place], node)
 
     def _elsewhere(self, node: int, others: Sequence[int]) -> list[int]:
         """Returns those of other nodes that nothing joins to a node."""
@@ -353,35 +370,47 @@ class KeyframeGraph:
 
     def _compare(self, task: Task, by_frame: dict[int, PosedView], places: Places) -> None:
         """Compares the features of two keyframes; aligns them next if they show the same."""
-        frame, keyframe = int(self.nodes.frames[task.first]), by_frame.get(int(self.nodes.frames[task.second]))
-        if keyframe is None or frame not in places:
+        first, second = self.nodes.frames[[task.first, task.second]].tolist()
+        if second not in by_frame or first not in places or second not in places:
             return
-        place = places.compare(frame, keyframe.view)
+        place = places.compare_keyframes(first, second, by_frame[second].view.camera)
         if place is not None:
             self._tasks.insert(0, replace(task, work=Work.CLOSE, T_second_first=place.T_cam_keyframe))
 
     def _find_loop(self, task: Task, by_frame: dict[int, PosedView]) -> None:
-        """Adds the loop between two nodes, if their images show it surely."""
-        there = self._aligned(task.first, task.second, by_frame, task.T_second_first, and_back=True)
+        """Aligns two nodes that are long apart; if their images may be a loop, the way back is measured next."""
+        there = self._aligned(task.first, task.second, by_frame, task.T_second_first)
         if there is None or (evidence := there.weigh()).explained < _LEAST_EXPLAINED:
             return
-        loop = Link.measured(task.first, task.second, se3.inverse(there.T_second_first), Kind.LOOP, evidence.covariance)
-        self._links.append(replace(loop, kind=Kind.FOUND))
+        found = replace(task, work=Work.RETURN, T_second_first=there.T_second_first, covariance=evidence.covariance)
+        self._tasks.insert(0, found)
 
-    def _aligned(
-        self, first: int, second: int, by_frame: dict[int, PosedView], T_second_first: Matrix, *, and_back: bool = False
-    ) -> PairResult | None:
+    def _return(self, task: Task, by_frame: dict[int, PosedView]) -> None:
+        """Adds a loop, if the way back agrees with the way there."""
+        last = max(task.first, task.second)
+        one, other = self._shot(task.first, by_frame, last), self._shot(task.second, by_frame, last)
+        if one is None or other is None or self._pairs is None:
+            return
+        if (np.array(self._pairs.way_back(one, other, task.T_second_first)) > _MAX_BACK).any():
+            return
+        loop = Link.measured(task.first, task.second, se3.inverse(task.T_second_first), Kind.LOOP, task.covariance)
+        self._found.append(replace(loop, kind=Kind.FOUND))
+        self._tasks = [other for other in self._tasks if (other.work, other.second) != (Work.COMPARE, task.second)]  # one is enough
+
+    def _aligned(self, first: int, second: int, by_frame: dict[int, PosedView], T_second_first: Matrix) -> PairResult | None:
         """Aligns the images of two nodes, starting at a motion [4, 4]; returns None if the result is not sure."""
         one, other = self._shot(first, by_frame, max(first, second)), self._shot(second, by_frame, max(first, second))
         if one is None or other is None or self._pairs is None:
             return None
         one = replace(one, view=one.view.through(other.view.camera))  # those of a map that was loaded may be of another camera
         there = self._pairs.align(one, other, T_second_first)
-        if there.overlap < _LEAST_OVERLAP or there.agreement < _LEAST_AGREEMENT:
-            return None
-        if and_back and not all(np.array(self._pairs.way_back(one, other, there)) <= _MAX_BACK):
-            return None
-        return there
+        return there if there.overlap >= _LEAST_OVERLAP and there.agreement >= _LEAST_AGREEMENT else None
+
+    def _is_time_to_solve(self, frame: int) -> bool:
+        """Returns whether a frame takes part in an optimisation in place of one task; of two frames at least one does."""
+        is_joined = not self._tasks or self._tasks[0].work is not Work.JOIN
+        is_due = self._schedule.is_disputed and is_joined
+        return (self._solving is not None or is_due) and (not self._tasks or frame % 2 == 1)
 
     def _shot(self, node: int, by_frame: dict[int, PosedView], as_known_at: int) -> Shot | None:
         """Returns the images of a node, taken with the readout known at another; None if they are gone."""
@@ -389,7 +418,7 @@ class KeyframeGraph:
         return None if keyframe is None else Shot(keyframe.view, self.nodes.motion(node, as_known_at))
 
     def _solve(self, frame: TrackedFrame) -> Corrections | None:
-        """Takes loops that were found into the graph, and optimises it, a few steps a frame.
+        """Begins an optimisation, or goes on with it.
 
         Args:
             frame: at which map and poses are corrected if the optimisation ends with it; it becomes a node.
@@ -398,11 +427,13 @@ class KeyframeGraph:
             How they are corrected; None if they stay.
         """
         if self._solving is None:
-            if self._accept():
-                self._begin_solving()
-            return None
-        num_nodes = self._solving.num_nodes
-        solution = self._solved(_STEPS_PER_FRAME)
+            self._schedule = self._schedule.disputed(is_disputed=False)
+            self._begin_solving()
+            steps = _steps_per_frame(len(self._active)) - 1
+        else:
+            steps = _steps_per_frame(self._solving.num_nodes)
+        assert self._solving is not None
+        num_nodes, solution = self._solving.num_nodes, self._solved(steps)
         if solution is None:
             return None
         nodes, least = self._active[:num_nodes], self._config.min_correction_m
@@ -413,13 +444,17 @@ class KeyframeGraph:
         self._extend(frame)
         return self._corrections(solution, nodes)
 
-    def _accept(self) -> bool:
-        """Takes the loops that were found into the graph. Returns whether one disagrees with the present poses."""
-        found = [link for link in self._links if link.kind is Kind.FOUND]
-        self._links = [link for link in self._links if link.kind is not Kind.FOUND]
+    def _accept(self) -> None:
+        """Takes the loops that were found into the graph."""
+        found, self._found = self._found, []
         loops = [one for loop in found for one in self._confirmed(replace(loop, kind=Kind.LOOP))]
         self._links += loops
-        return any(self._off(loop) > self._config.min_correction_m for loop in loops)
+        for loop in found:
+            place, frame = self.nodes.frames[[loop.first, loop.second]].tolist()
+            agrees = self._off(loop) <= self._config.min_correction_m
+            self._schedule = self._schedule.agreed(frame, place, self._every) if agrees else self._schedule.disagreed()
+        if any(self._off(loop) > self._config.min_correction_m for loop in loops):
+            self._schedule = self._schedule.disputed(is_disputed=True)
 
     def _begin_solving(self) -> None:
         self._solving = self._solving_from(None, len(self._active), len(self._links))
@@ -437,7 +472,7 @@ class KeyframeGraph:
 
     def _sure(self, count: int) -> list[Link]:
         """Returns those of the first links that are not in doubt."""
-        return [link for link in self._links[:count] if link.kind not in (Kind.PENDING, Kind.FOUND)]
+        return [link for link in self._links[:count] if link.kind is not Kind.PENDING]
 
     def _solved(self, most_steps: int = 10**6) -> Matrix | None:
         """Goes on with the optimisation, first with all loops, then without those that contradict the others.
@@ -518,6 +553,9 @@ class KeyframeGraph:
         T_world_cam[nodes] = solution
         self.nodes = self.nodes.moved(T_world_cam)
         self.num_corrections += 1
+        self.num_corrections += 1
+        is_apart = self._schedule.is_apart and bool(self._elsewhere(self._active[-1], self._active))
+        self._schedule = GraphSchedule(is_apart=is_apart)
         self._last_correction_m = float(np.linalg.norm(T_world_cam[-1, :3, 3] - T_last[:3, 3]))
         self.T_world_odom = corrections.motions[-1] @ self.T_world_odom
         return corrections
@@ -550,7 +588,8 @@ class KeyframeGraph:
     def rest(self) -> None:
         """Begins anew with the next keyframe, because time does; the map stays where it is."""
         self.nodes = Nodes()
-        self._active, self._links, self._tasks, self._solving = [], [], [], None
+        self._active, self._links, self._found, self._tasks = [], [], [], []
+        self._solving, self._schedule = None, GraphSchedule()
         self._is_interrupted = False
 
     def interrupt(self, newest: TrackedFrame | None) -> None:
@@ -566,9 +605,11 @@ class KeyframeGraph:
         """Forgets the keyframes of the frames from a number on."""
         self.nodes = self.nodes.before(frame)
         self._active = [node for node in self._active if node < len(self.nodes)]
-        self._links = [link for link in self._links if max(link.first, link.second) < len(self.nodes)]
+        self._links, self._found = (
+            [link for link in links if max(link.first, link.second) < len(self.nodes)] for links in (self._links, self._found)
+        )
         self._tasks = [task for task in self._tasks if max(task.first, task.second) < len(self.nodes)]
-        self._solving = None
+        self._schedule, self._solving = GraphSchedule(is_apart=self._schedule.is_apart), None
         last = len(self.nodes) - 1
         if self._active and self._active[-1] < last:  # it was merged into a node that is gone; the next frame is joined to it
             before = self._active[-1]
@@ -582,7 +623,8 @@ class KeyframeGraph:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Returns everything that later frames depend on, by name."""
-        graph = PoseGraph.of(self.nodes.T_world_cam, self._links)
+        links = [*self._links, *self._found]
+        graph = PoseGraph.of(self.nodes.T_world_cam, links)
         return {
             **{name: getattr(self.nodes, name) for name in Nodes.__dataclass_fields__},
             'active': np.array(self._active, dtype=np.int64),
@@ -590,10 +632,11 @@ class KeyframeGraph:
             'T_first_second': graph.T_first_second,
             'information': graph.information,
             'limits': graph.limits,
-            'kinds': np.array([link.kind for link in self._links], dtype=np.int64),
+            'kinds': np.array([link.kind for link in links], dtype=np.int64),
             'T_world_odom': self.T_world_odom,
             'num_corrections': np.array(self.num_corrections),
             'is_interrupted': np.array(self._is_interrupted),
+            'schedule': np.array(self._schedule.numbers(), dtype=np.int64),
             **self._unfinished(),
             'last_correction_m': np.array(self._last_correction_m),
         }
@@ -606,6 +649,7 @@ class KeyframeGraph:
         return {
             'tasks': np.array([(task.work, task.first, task.second) for task in tasks], dtype=np.int64).reshape(-1, 3),
             'task_motions': np.array([task.T_second_first for task in tasks]).reshape(-1, 4, 4),
+            'task_covariances': np.array([task.covariance for task in tasks]).reshape(-1, 6, 6),
             'solving': np.array([*counts, state.steps_at_width, state.steps, state.is_done], dtype=np.int64),
             'solving_widths': np.array([state.widening, state.damping]),
             'solving_poses': state.T_world_cam,
@@ -613,8 +657,9 @@ class KeyframeGraph:
 
     def _restore_unfinished(self, arrays: Arrays) -> None:
         """Continues with the work and the optimisation of ``_unfinished``."""
-        rows = zip(arrays['tasks'].tolist(), arrays['task_motions'], strict=True)
-        self._tasks = [Task(Work(work), first, second, T) for (work, first, second), T in rows]
+        self._schedule = GraphSchedule.of(arrays['schedule'].tolist())
+        rows = zip(arrays['tasks'].tolist(), arrays['task_motions'], arrays['task_covariances'], strict=True)
+        self._tasks = [Task(Work(work), first, second, T, covariance) for (work, first, second), T, covariance in rows]
         num_nodes, num_links, is_second, at_width, steps, is_done = arrays['solving'].tolist()
         if num_nodes:
             widening, damping = arrays['solving_widths'].tolist()
@@ -636,7 +681,7 @@ class KeyframeGraph:
             raise ValueError(f'graph: the numbers in {", ".join(broken)} are not finite')
         num_nodes, num_links, num_tasks = len(arrays['frames']), len(arrays['kinds']), len(arrays['tasks'])
         counts = dict.fromkeys(Nodes.__dataclass_fields__, num_nodes)
-        counts |= dict.fromkeys(('pairs', *_LINK_ARRAYS), num_links) | {'tasks': num_tasks, 'task_motions': num_tasks}
+        counts |= dict.fromkeys(('pairs', *_LINK_ARRAYS), num_links) | dict.fromkeys(_TASK_ARRAYS, num_tasks)
         counts |= {'solving_poses': int(arrays['solving'].flat[0]) if arrays['solving'].size else 0}
         shapes = {name: (count, *expected[name].shape[1:]) for name, count in counts.items()}
         shapes |= {name: expected[name].shape for name in _SINGLE_ARRAYS}
@@ -650,10 +695,17 @@ class KeyframeGraph:
         self.nodes = Nodes(**{name: arrays[name] for name in Nodes.__dataclass_fields__})
         self._active, self._is_interrupted = arrays['active'].tolist(), bool(arrays['is_interrupted'])
         columns = [arrays[name] for name in ('pairs', *_LINK_ARRAYS)]
-        self._links = [
+        links = [
             Link(int(first), int(second), T, information, float(limit), kind=Kind(kind))
             for (first, second), T, information, limit, kind in zip(*columns, strict=True)
         ]
+        self._links = [link for link in links if link.kind is not Kind.FOUND]
+        self._found = [link for link in links if link.kind is Kind.FOUND]
         self.T_world_odom, self.num_corrections = arrays['T_world_odom'], int(arrays['num_corrections'])
         self._last_correction_m = float(arrays['last_correction_m'])
         self._restore_unfinished(arrays)
+
+
+def _steps_per_frame(num_nodes: int) -> int:
+    """Returns how many steps of an optimisation a frame has time for."""
+    return max(1, min(_MOST_STEPS, _NODES_PER_FRAME // num_nodes))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
@@ -60,16 +60,13 @@ class Link(Edge):
 
 
 class Work(IntEnum):
-    """What a task does."""
+    """What a task does: at most one alignment of two keyframes, or as much."""
 
     JOIN = 0  # align two keyframes of the window
-    CLOSE = 1  # align two keyframes that are long apart, there and back
+    CLOSE = 1  # align two keyframes that are long apart
     LOOK = 2  # find keyframes that show the same features
     COMPARE = 3  # match the features of two keyframes
-
-
-COST = {Work.JOIN: 1, Work.CLOSE: 2, Work.LOOK: 1, Work.COMPARE: 1}
-"""How much work a task is, in alignments of two keyframes."""
+    RETURN = 4  # align two keyframes that are long apart the other way round, which confirms a loop
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,13 +77,15 @@ class Task:
         work: what is to be done.
         first: number of a node; of LOOK it is that of the second.
         second: number of the node that came later.
-        T_second_first: [4, 4] where alignment starts: camera of the first to camera of the second.
+        T_second_first: [4, 4] where alignment starts: camera of the first to camera of the second; of RETURN what was found.
+        covariance: [6, 6] of RETURN: that of what was found.
     """
 
     work: Work
     first: int
     second: int
     T_second_first: Matrix
+    covariance: Matrix = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 def size(T: Matrix) -> float:
@@ -125,17 +124,25 @@ def renumbered(links: Sequence[Link], nodes: Sequence[int]) -> list[Edge]:
 
 def parts(count: int, edges: Sequence[Edge]) -> NDArray[np.intp]:
     """Returns [N] for each of so many poses the first pose that edges connect it to, over any number of others."""
-    part = np.arange(count)
+    before = list(range(count))  # an earlier pose of the same part; itself where there is none
+
+    def first_of(pose: int) -> int:
+        while before[pose] != pose:
+            before[pose] = before[before[pose]]
+            pose = before[pose]
+        return pose
+
     for edge in edges:
-        ends = part[[edge.first, edge.second]]
-        if ends[0] != ends[1]:
-            part[part == ends.max()] = ends.min()
-    return part
+        ends = first_of(edge.first), first_of(edge.second)
+        before[max(ends)] = min(ends)
+    return np.array([first_of(pose) for pose in range(count)], dtype=np.intp)
 
 
 def brought_together(T_world_cam: Matrix, edges: Sequence[Edge], part: NDArray[np.intp]) -> Matrix:
     """Returns poses [N, 4, 4], of which the parts [N] that lie far from where an edge says are moved there as a whole."""
     result, done = T_world_cam.copy(), {0}
+    if not part.any():
+        return result
     for edge in sorted(edges, key=lambda edge: max(edge.first, edge.second)):
         ends = [int(part[edge.first]), int(part[edge.second])]
         if ends[0] == ends[1] or (ends[0] in done) == (ends[1] in done):

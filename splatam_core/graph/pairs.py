@@ -76,10 +76,10 @@ class PairAligner:
             weigh=found.weigh,
         )
 
-    def way_back(self, first: Shot, second: Shot, there: PairResult) -> tuple[float, float]:
-        """Aligns the first view to the second. Returns how far from the way there that ends: metres and radians."""
-        back = self.align(second, first, se3.inverse(there.T_second_first))
-        off = se3.log(back.T_second_first @ there.T_second_first)
+    def way_back(self, first: Shot, second: Shot, T_second_first: Matrix) -> tuple[float, float]:
+        """Aligns the first view to the second. Returns how far from the way there [4, 4] that ends: metres and radians."""
+        back = self.align(second, first, se3.inverse(T_second_first))
+        off = se3.log(back.T_second_first @ T_second_first)
         return float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:]))
 
     def _pyramid(self, shot: Shot) -> list[Level]:

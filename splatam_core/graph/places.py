@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.se3 import Matrix
@@ -34,6 +35,8 @@ MAX_WIDTH = 320
 _FAST_THRESHOLD = 7  # of 255; the default, 20, finds little in a blurred frame
 _NUM_TABLES, _KEY_BITS = 4, 16  # parts of a descriptor that are looked up, and their length
 _NUM_ALIKE, _NUM_OTHERS = 6, 6  # keyframes whose descriptors are matched, for each view
+_MOST_RANKED = 128  # places that are ranked for a keyframe
+_GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples modulo 1 visit everything evenly
 _NEAR_M, _NEAR_RAD = 0.15, 0.15  # keyframes that are nearer to each other show the same
 _FARTHEST = 80  # bits of 256 in which matched descriptors differ
 _LARGEST_ERROR = 0.0125  # reprojection error of an inlier, as a fraction of the width: 4 pixels of 320
@@ -72,17 +75,26 @@ class _Keyframe:
         descriptors: [K, 32] uint8 of the features with depth.
         points: [K, 3] float32 where they are in its camera.
         keys: [K * tables] int32 of the descriptors, see ``_keys``.
+        source: [4, 4] the tensor from which its pose was read; None where it was not read from one.
     """
 
     T_cam_world: Matrix
     descriptors: NDArray[np.uint8]
     points: NDArray[np.float32]
     keys: NDArray[np.int32]
+    source: Tensor | None = None
 
     @classmethod
     def of(cls, T_cam_world: Matrix, descriptors: NDArray[np.uint8], points: NDArray[np.float32]) -> _Keyframe:
         """Returns a keyframe with some features."""
         return cls(T_cam_world, descriptors, points, _keys(descriptors))
+
+    @classmethod
+    def seen_in(cls, view: View, T_cam_world: Matrix) -> _Keyframe:
+        """Returns a keyframe with the features of a view."""
+        seen = _Features.of(view)
+        has_depth = seen.points[:, 2] > 0
+        return cls.of(T_cam_world, seen.descriptors[has_depth], seen.points[has_depth])
 
 
 class Places:
@@ -106,19 +118,18 @@ class Places:
             view: its images, in the host's memory; the full frame has more to recognise than what is kept of it for mapping.
             T_cam_world: [4, 4] its pose.
         """
-        seen = _Features.of(view)
-        has_depth = seen.points[:, 2] > 0
-        self._keyframes[keyframe] = _Keyframe.of(T_cam_world, seen.descriptors[has_depth], seen.points[has_depth])
+        self._keyframes[keyframe] = _Keyframe.seen_in(view, T_cam_world)
 
     def follow(self, keyframes: Iterable[PosedView]) -> None:
         """Adds, drops and moves places, so that they are those of the given keyframes, by number, at their present poses."""
         old, self._keyframes = self._keyframes, {}
         for posed in keyframes:
-            T_cam_world = posed.T_cam_world.double().numpy(force=True)
-            if posed.frame in old:
-                self._keyframes[posed.frame] = replace(old[posed.frame], T_cam_world=T_cam_world)
-            else:
-                self.add(posed.frame, posed.view, T_cam_world)
+            known = old.get(posed.frame)
+            if known is None or known.source is not posed.T_cam_world:
+                T_cam_world = posed.T_cam_world.double().numpy(force=True)
+                known = _Keyframe.seen_in(posed.view, T_cam_world) if known is None else replace(known, T_cam_world=T_cam_world)
+                known = replace(known, source=posed.T_cam_world)
+            self._keyframes[posed.frame] = known
 
     def arrays(self) -> Arrays:
         """Returns the features of all places, by name; ``restore`` takes them, and ``follow`` gives them their poses."""
@@ -181,6 +192,32 @@ class Places:
         """Returns where a view was perhaps taken, if it shows what a keyframe shows; None if too few features agree on a pose."""
         return self._compare(keyframe, self._features(view))
 
+    def alike(self, keyframe: int, among: Sequence[int], limit: int) -> list[int]:
+        """Returns the numbers of the keyframes that look most like one of them, which is known; at most ``limit``.
+
+        Of very many, only every n-th is considered, so that the time does not grow: other ones for the next keyframe.
+
+        Args:
+            keyframe: its number.
+            among: numbers of those that are considered.
+            limit: largest number of keyframes.
+        """
+        known, step = [number for number in among if number in self._keyframes], -(-len(among) // _MOST_RANKED)
+        chosen = known[int(keyframe * _GOLDEN % 1 * step) :: step] if step > 1 else known
+        ranked = self._by_shared_keys(self._keyframes[keyframe].keys, chosen)
+        return [ranked[index] for index in _apart([self._keyframes[number].T_cam_world for number in ranked], limit)]
+
+    def compare_keyframes(self, keyframe: int, other: int, camera: PinholeCamera) -> Place | None:
+        """Returns where one keyframe was perhaps taken, if it shows what another one shows; None if too few features agree.
+
+        Args:
+            keyframe: number of the other one, whose pose is known.
+            other: number of the one whose pose is asked for.
+            camera: of the pixels in which an error counts.
+        """
+        kept = self._keyframes[other]
+        return self._compare(keyframe, _Features(camera, _projected(kept.points, camera), kept.descriptors, kept.points))
+
     def _features(self, view: View) -> _Features:
         """Returns the features of a view; those of the last one are kept."""
         if self._last is None or self._last[0] is not view:
@@ -189,14 +226,14 @@ class Places:
 
     def _ranked(self, descriptors: NDArray[np.uint8], exclude: Collection[int]) -> list[int]:
         """Returns the numbers of the keyframes, the one with most keys of the descriptors [K, 32] first."""
+        return self._by_shared_keys(_keys(descriptors), [number for number in self._keyframes if number not in exclude])
+
+    def _by_shared_keys(self, keys: NDArray[np.int32], numbers: Sequence[int]) -> list[int]:
+        """Returns numbers of keyframes, the one with most of some keys [K * tables] first."""
         is_key = np.zeros(_NUM_TABLES << _KEY_BITS, np.uint8)
-        is_key[_keys(descriptors)] = 1
-        shared = {
-            number: int(is_key.take(keyframe.keys).sum(dtype=np.int64))
-            for number, keyframe in self._keyframes.items()
-            if number not in exclude
-        }
-        return sorted(shared, key=lambda number: (-shared[number], number))
+        is_key[keys] = 1
+        shared = {number: int(is_key.take(self._keyframes[number].keys).sum(dtype=np.int64)) for number in numbers}
+        return sorted(numbers, key=lambda number: (-shared[number], number))
 
     def _spread(self, ranked: list[int]) -> list[int]:
         """Returns the keyframes of a ranking without those that are near one before them."""
@@ -282,19 +319,22 @@ class _Matches:
         return best if best[1].sum() < _MIN_INLIERS else self._refined(*best)
 
     def _groups(self) -> Iterator[NDArray[np.bool_]]:
-        """Yields [K] matches that agree with one match about distances, for those with which most agree."""
+        """Yields [K] matches that agree with one match about distances, for those with which most agree; each group once."""
         known = np.flatnonzero(self.seen[:, 2] > 0)
         if len(known) < _MIN_INLIERS // 2:
             return
         points, seen = self.points[known], self.seen[known]
         noise = _DEPTH_NOISE[0] + _DEPTH_NOISE[1] * (points[:, 2] + seen[:, 2])
-        apart, seen_apart = (np.linalg.norm(each[:, None] - each, axis=2) for each in (points, seen))
+        apart, seen_apart = _distances(points), _distances(seen)
         agrees = (np.abs(apart - seen_apart) < np.maximum(noise[:, None], noise)) & (apart > _FAR_APART_M)
+        groups: set[bytes] = set()
         for seed in np.argsort(-agrees.sum(axis=1), kind='stable')[:_NUM_SEEDS]:
             votes = agrees[agrees[seed]].sum(axis=0)  # of those that agree with the seed
             members = np.zeros(len(self.points), bool)
             members[known[agrees[seed] & (2 * votes >= votes[seed])]] = True
-            yield members
+            if members.tobytes() not in groups:
+                groups.add(members.tobytes())
+                yield members
 
     def _agreeing(self, T: Matrix) -> NDArray[np.bool_]:
         """Returns [K] which points a motion [4, 4] takes to where the view shows them."""
@@ -315,18 +355,27 @@ class _Matches:
         return (refined, agreeing) if np.isfinite(refined).all() and agreeing.sum() >= inliers.sum() else (T, inliers)
 
 
-def _apart(T_cam_world: Sequence[Matrix]) -> list[int]:
-    """Returns the indices of the poses [4, 4] that are not near one before them."""
+def _apart(T_cam_world: Sequence[Matrix], limit: int | None = None) -> list[int]:
+    """Returns the indices of the poses [4, 4] that are not near one before them, the first ones up to a limit."""
     poses = np.array(T_cam_world).reshape(-1, 4, 4)
     centres = -np.einsum('nji,nj->ni', poses[:, :3, :3], poses[:, :3, 3])
-    is_free, chosen = np.ones(len(poses), bool), []
+    is_free, chosen = np.ones(len(poses), bool), list[int]()
     for index in range(len(poses)):
+        if len(chosen) == limit:
+            break
         if is_free[index]:
             chosen.append(index)
             cosines = (np.einsum('nij,ij->n', poses[:, :3, :3], poses[index, :3, :3]) - 1) / 2
             near = np.linalg.norm(centres - centres[index], axis=1) < _NEAR_M
             is_free &= ~(near & (cosines > math.cos(_NEAR_RAD)))
     return chosen
+
+
+def _distances(points: Matrix) -> Matrix:
+    """Returns [K, K] the distances between points [K, 3], exact to a micrometre: three times as fast as by differences."""
+    centred = points - points.mean(axis=0)
+    lengths = np.square(centred).sum(axis=1)
+    return np.sqrt(np.maximum(lengths[:, None] + lengths - 2 * centred @ centred.T, 0))
 
 
 def _rigid(points: Matrix, others: Matrix) -> Matrix:
@@ -352,6 +401,12 @@ def _points(view: View, pixels: Matrix) -> NDArray[np.float32]:
     camera = view.camera
     x, y = (pixels[:, 0] - camera.cx) / camera.fx * z, (pixels[:, 1] - camera.cy) / camera.fy * z
     return np.stack([x, y, z], axis=1).astype(np.float32)
+
+
+def _projected(points: NDArray[np.float32], camera: PinholeCamera) -> Matrix:
+    """Returns [K, 2] the pixels of points [K, 3] in front of a camera."""
+    x, y, z = points.T.astype(np.float64)
+    return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
 
 
 def _keys(descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:

@@ -38,6 +38,7 @@ PRESET_THEN: dict[str, dict[str, object]] = {
         'mapping.max_gaussians': 0,
         'mapping.fused.final_passes': 12,
         'tracking.align.relocalisation.enabled': False,
+        'graph.enabled': False,
     }
 }
 

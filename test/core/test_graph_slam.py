@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from splatam_core.config import load_config
+from splatam_core.config import load_config, preset_names
 from splatam_core.datasets.registry import open_sequence
 from splatam_core.errors import FrameError
 from splatam_core.geometry import se3
@@ -74,6 +74,15 @@ def test_final_poses_are_those_in_the_final_map(run: tuple[Slam, list[FrameResul
     assert (final[0] == np.eye(4)).all()
 
 
+def test_only_the_robots_preset_has_a_graph() -> None:
+    assert [name for name in preset_names() if load_config(name).graph.enabled] == ['realtime']
+
+
+def test_true_poses_are_not_corrected() -> None:
+    config = load_config('realtime', ['threads=1', 'tracking.method=truth', 'graph.enabled=true'])
+    assert not Slam(config, true_motion=lambda *_: np.eye(4)).graph.is_used
+
+
 def test_without_a_graph_nothing_is_kept(there_and_back: list[RgbdFrame]) -> None:
     slam = slam_with('graph.enabled=false')
     results = [slam.process(frame) for frame in there_and_back[:4]]
@@ -106,6 +115,15 @@ def test_it_can_be_switched_on_and_off_between_frames(there_and_back: list[RgbdF
         sizes.append(slam.graph.summary.nodes)
     assert sizes[:2] == [0, 0] and sizes[5] == sizes[9] > 1 and sizes[-1] > sizes[9]
     assert slam.optimize_graph() >= 0 and slam.graph.num_loops > 0
+
+
+def test_where_nothing_is_corrected_results_are_those_without_a_graph(there_and_back: list[RgbdFrame]) -> None:
+    """Bit for bit, although loops are found."""
+    with_graph, without = slam_with('graph.enabled=true', 'graph.min_correction_m=1'), slam_with('graph.enabled=false')
+    ends = [[slam.process(frame) for frame in there_and_back] for slam in (with_graph, without)]
+    assert with_graph.graph.num_loops > 0 == with_graph.graph.num_corrections
+    assert all(np.array_equal(first.T_world_cam, second.T_world_cam) for first, second in zip(*ends, strict=True))
+    assert all(np.array_equal(values, without.map.arrays()[name]) for name, values in with_graph.map.arrays().items())
 
 
 @pytest.mark.parametrize(('broken', 'costs_the_frame'), [('track', True), ('_plan', False)])

@@ -38,31 +38,40 @@ class TruePairs:
 
     def __init__(self, truth: np.ndarray, wrong: np.ndarray | None = None) -> None:
         self.truth, self.numbers, self.wrong, self.rng = truth, {}, wrong, np.random.default_rng(0)
+        self.num_aligned = 0
 
     def align(self, first: Shot, second: Shot, T_second_first: np.ndarray) -> PairResult:
         i, j = self.numbers[first.view], self.numbers[second.view]
+        self.num_aligned += 1
         T = motions.between(self.truth[j], self.truth[i]) @ se3.exp(0.001 * self.rng.standard_normal(6))
         if self.wrong is not None and j - i > 4:
             T = self.wrong @ T
         return PairResult(T, 0.8, 0.99, lambda: Evidence(1e-6 * np.eye(6), 0, 1.0, 48, 0.01))
 
-    def way_back(self, first: Shot, second: Shot, there: PairResult) -> tuple[float, float]:
+    def way_back(self, first: Shot, second: Shot, T_second_first: np.ndarray) -> tuple[float, float]:
+        self.num_aligned += 1
         return 0.0, 0.0
+
+
+def num_steps(graph: KeyframeGraph) -> int:
+    """How many steps the optimisation that goes on has taken."""
+    return 0 if graph._solving is None else graph._solving.optimizer.state.steps
 
 
 class Drifting:
     """A camera that tracks with drift, in the corrected map, and its keyframes."""
 
-    def __init__(self, truth: np.ndarray, wrong: np.ndarray | None = None, budget: int = 0) -> None:
+    def __init__(self, truth: np.ndarray, wrong: np.ndarray | None = None, budget: int = 0, drift: np.ndarray = DRIFT) -> None:
         self.graph = KeyframeGraph(CONFIG, TorchAligner())
         self.pairs = self.graph._pairs = TruePairs(truth, wrong)
-        self.places, self.begins = None, None
+        self.places, self.begins, self.drift = None, None, drift
+        self.work: list[tuple[int, int]] = []  # alignments and steps of the optimisation, of each frame
         self.truth, self.budget, self.keyframes, self.published, self.where = truth, budget, [], [], np.eye(4)
 
     def run(self, begin: int = 0, end: int | None = None) -> Drifting:
         for number in range(begin, len(self.truth) if end is None else end):
             if number:
-                self.where = self.where @ motions.between(self.truth[number - 1], self.truth[number]) @ se3.exp(DRIFT)
+                self.where = self.where @ motions.between(self.truth[number - 1], self.truth[number]) @ se3.exp(self.drift)
             view = View(CAMERA, torch.zeros(24, 32, 3, dtype=torch.uint8), torch.full((24, 32), 2.0))
             self.pairs.numbers[view] = number
             self.published.append(self.where)
@@ -73,7 +82,9 @@ class Drifting:
                 frame = TrackedFrame(EVERY * number + after, 10 * number + after, self.where, np.zeros((6, 6)))
                 if number == self.begins and not after:
                     frame = replace(frame, begins=True)
+                before = self.pairs.num_aligned, num_steps(self.graph)
                 corrections = self.graph.follow(frame, self.keyframes, self.places)
+                self.work.append((self.pairs.num_aligned - before[0], max(0, num_steps(self.graph) - before[1])))
                 if corrections is None:
                     continue
                 moved = corrections.at(np.array([keyframe.frame for keyframe in self.keyframes]))
@@ -97,6 +108,21 @@ def test_loops_take_drift_back() -> None:
     assert camera.errors_m().max() < 0.05 and camera.errors_m()[-1] < 0.03 < 0.1 < 60 * np.linalg.norm(DRIFT[:3])
     assert without.max() < 0.1  # published poses profit from the corrections as well
     np.testing.assert_allclose(camera.graph.T_world_odom[:3, :3] @ camera.graph.T_world_odom[:3, :3].T, np.eye(3), atol=1e-9)
+
+
+def test_a_frame_has_a_bounded_part_of_the_work() -> None:
+    """One alignment, or some steps of an optimisation; also where many loops are found, and correct poses."""
+    camera = Drifting(there_and_back(60)).run()
+    assert camera.graph.num_corrections >= 1 and {number for number, _ in camera.work} == {0, 1}
+    assert max(steps for _, steps in camera.work) <= 4
+
+
+def test_loops_that_agree_are_looked_for_more_and_more_rarely() -> None:
+    """On the way back every keyframe sees a place again, at last from long ago; where poses drift, each is compared with two."""
+    exact, drifting = (Drifting(there_and_back(200), drift=drift).run().graph for drift in (np.zeros(6), DRIFT))
+    assert exact.num_corrections == 0 < drifting.num_corrections
+    late = [sum(loop.second > 150 for loop in graph.loops()) for graph in (exact, drifting)]
+    assert 5 < late[0] < 20 < 25 < late[1]
 
 
 def test_a_wrong_loop_changes_nothing() -> None:
@@ -217,10 +243,10 @@ def drifted() -> Drifting:
 
 
 def test_odometry_that_drifts_gives_way_to_pairs() -> None:
-    """Its errors are alike from one keyframe to the next, and those of pairs are not: 3 mm are left of more than 8 cm."""
+    """Its errors are alike from one keyframe to the next, and those of pairs are not: 5 mm are left of more than 8 cm."""
     camera = drifted()
     camera.graph.settle(None)
-    assert camera.errors_m().max() < 0.003
+    assert camera.errors_m().max() < 0.005
 
 
 def test_frames_after_the_last_keyframe_move_with_it() -> None:
@@ -245,7 +271,8 @@ def test_a_pause_keeps_what_was_corrected() -> None:
     camera.graph.follow(replace(FRAME, index=299, stamp_ns=10_000, T_world_cam=camera.where), camera.keyframes)
     np.testing.assert_array_equal(camera.graph.corrected(stamps_ns, published), final)
     assert camera.graph.num_loops > 5 and camera.graph.nodes.frames[-2:].tolist() == [298, 299]
-    assert camera.graph._links[-1].information[0, 0] < 0.1 * camera.graph._links[-2].information[0, 0]  # nobody saw the way
+    way, before = [link for link in camera.graph._links if link.kind is Kind.ODOMETRY][:-3:-1]
+    assert way.information[0, 0] < 0.1 * before.information[0, 0]  # nobody saw the way
     camera.graph.follow(replace(FRAME, index=300, stamp_ns=1, T_world_cam=camera.where, found_at=-1), camera.keyframes)
     assert camera.graph.nodes.frames.tolist() == [300]  # time went back
 
@@ -265,7 +292,7 @@ def test_loops_to_a_map_that_was_loaded_correct_what_comes() -> None:
     np.testing.assert_allclose(graph.nodes.T_world_cam[:30], truth[:30], atol=1e-6)  # float32
     assert (graph.nodes.T_world_cam[30] == truth[0]).all()
     graph.settle(None)
-    assert camera.errors_m().max() < 0.03 < 0.1 < 60 * np.linalg.norm(DRIFT[:3])
+    assert camera.errors_m().max() < 0.05 < 0.1 < 60 * np.linalg.norm(DRIFT[:3])  # the last keyframes were not looked for
 
 
 class TruePlaces:
@@ -277,14 +304,13 @@ class TruePlaces:
     def __contains__(self, frame: int) -> bool:
         return True
 
-    def candidates(self, view: View, exclude: list[int]) -> list[int]:
-        truth, number = self.camera.truth, self.camera.pairs.numbers[view]
-        known = [keyframe.frame for keyframe in self.camera.keyframes if keyframe.frame not in exclude]
-        return [frame for frame in known if np.linalg.norm((truth[frame // EVERY] - truth[number])[:3, 3]) < 0.06]
+    def alike(self, keyframe: int, among: list[int], limit: int) -> list[int]:
+        place = self.camera.truth[keyframe // EVERY]
+        return [frame for frame in among if np.linalg.norm((self.camera.truth[frame // EVERY] - place)[:3, 3]) < 0.06][:limit]
 
-    def compare(self, frame: int, view: View) -> Place:
-        T = motions.between(self.camera.truth[self.camera.pairs.numbers[view]], self.camera.truth[frame // EVERY])
-        return Place(frame, T, T, 100, 100)
+    def compare_keyframes(self, keyframe: int, other: int, camera: PinholeCamera) -> Place:
+        T = motions.between(self.camera.truth[other // EVERY], self.camera.truth[keyframe // EVERY])
+        return Place(keyframe, T, T, 100, 100)
 
 
 def test_a_new_map_joins_the_old_one_where_loops_say() -> None:
