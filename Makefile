@@ -196,7 +196,7 @@ ARM_BUILD := CFLAGS='-idirafter $(ARM_ROOT)/usr/include' CXXFLAGS='-idirafter $(
 # fitting), alignment, the checks of arrays, and SLAM of ten frames with one thread and with several.
 ARM_TESTS := test/core/test_rasterizer_contract.py test/core/test_torch_aligner.py test/core/test_native_bindings.py test/core/test_threads.py
 ARM_CHOSEN := (cpu-1 and (small or by_hand or hides or stops or near_plane)) or generic-size0 or (size2 and native_one) or holes_are \
-	or nothing_in_sight or native_bindings or slam_is_the_same
+	or nothing_in_sight or native_bindings or slam_is_the_same or ((descent or fitted_well) and generic)
 
 $(ARM_DIR)/.root:
 	@for program in $(ARM)-g++ $(ARM_QEMU) mmdebstrap; do

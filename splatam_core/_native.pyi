@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core.geometry.camera import PinholeCamera
-from splatam_core.tracking.aligner import Linearization
+from splatam_core.tracking.aligner import AlignmentState, Descent, Linearization
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -89,8 +89,12 @@ class Engine:
         depth_weight: float,
         color_limit: float,
         depth_limit: float,
+        enough: float,
     ) -> float:
-        """Takes one Adam step in place, with ``rates`` for the first four arrays. Returns the loss before the step."""
+        """Takes one Adam step in place, with ``rates`` for the first four arrays. Returns the loss before the step.
+
+        Tiles with less loss per pixel than ``enough`` give no gradients.
+        """
 
 class LinearSystem:
     """See ``tracking.aligner.LinearSystem``."""
@@ -143,6 +147,7 @@ class Aligner:
     ) -> tuple[Floats, Floats]: ...
     def halve(self, brightness: Floats, depth: Floats, max_step: float) -> tuple[Floats, Floats]: ...
     def linearize(self, at: Linearization[Floats], *, inlier_color: float, inlier_depth: float) -> LinearSystem: ...
+    def descend(self, task: Descent[Floats], start: AlignmentState) -> AlignmentState: ...
     def evidence(self, at: Linearization[Floats], *, max_depth_error: float, step: int) -> EvidenceSums: ...
 
 def solve_blocks(place: NDArray[np.int32], blocks: Doubles, right_hand_side: Doubles) -> None:

@@ -357,6 +357,12 @@ class FusedMappingConfig:
         'Increase to save time.',
         minimum=0.0, maximum=1.0,
     )  # fmt: skip
+    tolerance: float = setting(
+        0.0,
+        'Parts of a view, 8x8 pixels each, are not fitted further where the map is off by less than this colour error (root mean '
+        'square, colours from 0 to 1; an error of depth counts as the loss weighs it). 0 = all are. Increase to save time.',
+        minimum=0.0, maximum=1.0,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -387,8 +393,8 @@ class MappingConfig:
         0, 'Largest width at which views are fitted; 0 = no limit. Decrease to save time.', unit='px', minimum=0, maximum=MAX_PX
     )
     half_size_every: int = setting(
-        0, 'Fit the view at half its size in every n-th step of a frame, for a quarter of the work; 0 = never. Decrease to '
-        'save time.',
+        0, 'Fit the view at half its size in every n-th step, counted over all frames, for a quarter of the work; 0 = never. '
+        'Decrease to save time.',
         unit='steps', minimum=0, maximum=MAX_STEPS,
     )  # fmt: skip
     anisotropic: bool = setting(

@@ -50,23 +50,27 @@ void add(Aligner::RowMoments& total, const Aligner::RowMoments& part) {
   for (int i = 0; i < kUnknowns; ++i) total.g1[i] += part.g1[i];
 }
 
-// See Aligner::frame_images; one row or column of count pixels, stride floats apart.
-void fill_line(float* line, int count, std::size_t stride, int max_gap, float max_step) {
-  int before = -1;
-  for (int i = 0; i < count; ++i) {
-    const float far_side = line[i * stride];
-    if (!(far_side > 0.0f)) continue;  // NaN is none
-    const int gap = i - before - 1;
-    if (before >= 0 && gap > 0 && gap <= max_gap) {
-      const float near_side = line[before * stride];
-      if (std::fabs(far_side - near_side) <= max_step * std::min(near_side, far_side))
-        for (int k = 1; k <= gap; ++k) {
-          const float t = float(k) / float(gap + 1);
-          line[(before + k) * stride] = 1.0f / ((1.0f - t) / near_side + t / far_side);
-        }
+// See Aligner::frame_images; `lines` rows or columns next to each other of count pixels, which are stride floats apart.
+// They are filled side by side: along a column, each pixel is in another line of the cache.
+void fill_lines(float* first, int lines, std::size_t apart, int count, std::size_t stride, int max_gap,
+                float max_step) {
+  int before[kRowsPerPiece];
+  std::fill_n(before, lines, -1);
+  for (int i = 0; i < count; ++i)
+    for (int line = 0; line < lines; ++line) {
+      float* values = first + line * apart;
+      const float far_side = values[i * stride];
+      if (!(far_side > 0.0f)) continue;  // NaN is none
+      const int last = before[line], gap = i - last - 1;
+      before[line] = i;
+      if (last < 0 || gap == 0 || gap > max_gap) continue;
+      const float near_side = values[last * stride];
+      if (!(std::fabs(far_side - near_side) <= max_step * std::min(near_side, far_side))) continue;
+      for (int k = 1; k <= gap; ++k) {
+        const float t = float(k) / float(gap + 1);
+        values[(last + k) * stride] = 1.0f / ((1.0f - t) / near_side + t / far_side);
+      }
     }
-    before = i;
-  }
 }
 
 }  // namespace
@@ -149,11 +153,11 @@ void Aligner::frame_images(const std::uint8_t* rgb, const float* readings, int w
         brightness[at] = luminance(rgb[3 * at], rgb[3 * at + 1], rgb[3 * at + 2]) / 255.0f;
         depth[at] = readings[at] > 0.0f ? readings[at] : kNone;
       }
-      fill_line(depth + row, width, 1, max_gap, max_step);
+      fill_lines(depth + row, 1, 0, width, 1, max_gap, max_step);
     }
   });
   for_rows(width, [&](int, int, int begin, int end) {
-    for (int x = begin; x < end; ++x) fill_line(depth + x, height, std::size_t(width), max_gap, max_step);
+    fill_lines(depth + begin, end - begin, 1, height, std::size_t(width), max_gap, max_step);
   });
 }
 

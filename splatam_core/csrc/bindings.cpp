@@ -10,6 +10,7 @@
 #include "arrays.hpp"
 #include "blender_bindings.hpp"
 #include "block_cholesky.hpp"
+#include "descent.hpp"
 #include "engine.hpp"
 
 namespace py = pybind11;
@@ -123,7 +124,7 @@ double fit(Engine& engine, const py::object& means, const py::object& log_scales
            const py::object& rgb, const py::object& bounds, const py::object& moments, const py::object& steps,
            const std::array<float, 4>& rates, const py::object& T_cam_world, const py::object& camera,
            const py::object& target_rgb, const py::object& target_depth, float color_weight, float depth_weight,
-           float color_limit, float depth_limit) {
+           float color_limit, float depth_limit, float enough) {
   const GivenGaussians given{means, log_scales, logit_opacities, rgb};
   const MutableGaussians gaussians = given.write();
   const py::ssize_t n = given.count();
@@ -137,7 +138,8 @@ double fit(Engine& engine, const py::object& means, const py::object& log_scales
                       color_weight,
                       depth_weight,
                       color_limit,
-                      depth_limit};
+                      depth_limit,
+                      enough};
   float* limits = written_or_null<float>(bounds, "bounds", {blocks_of(n), kBounds});
   py::gil_scoped_release release;
   return engine.fit(gaussians, std::size_t(n), limits, adam, step_sizes, pinhole, pose, target);
@@ -172,42 +174,80 @@ GivenLevel level_of(const py::object& brightness, const py::object& depth) {
           values<float>(depth, "depth", {size.height, size.width})};
 }
 
-// An attribute of a Linearization (splatam_core/tracking/aligner.py).
-py::object member(const py::object& at, const char* name) {
-  if (!py::hasattr(at, name)) throw py::type_error(std::string("at has no ") + name + "; expected a Linearization");
-  return at.attr(name);
-}
+// A dataclass of splatam_core/tracking, and its attributes.
+struct Given {
+  py::object object;
+  const char *name, *type;
 
-float number(const py::object& at, const char* name) {
-  try {
-    return member(at, name).cast<float>();
-  } catch (const py::cast_error&) {
-    throw py::type_error(std::string(name) + " is no number; expected a float");
+  py::object member(const char* attribute) const {
+    if (!py::hasattr(object, attribute))
+      throw py::type_error(std::string(name) + " has no " + attribute + "; expected " + type);
+    return object.attr(attribute);
   }
+
+  template <typename T = float>
+  T number(const char* attribute) const {
+    try {
+      return member(attribute).cast<T>();
+    } catch (const py::cast_error&) {
+      throw py::type_error(std::string(attribute) + " is no number; expected " +
+                           (std::is_integral_v<T> ? "an int" : "a float"));
+    }
+  }
+
+  template <typename T>
+  void copy(const char* attribute, T* to, py::ssize_t count) const {
+    const py::object array = member(attribute);
+    std::copy_n(values<T>(array, attribute, {count}), count, to);
+  }
+};
+
+Motion motion_of(const py::handle& given, const char* name) {
+  const py::array_t<double> T = checked<double>(given, name, {4, 4});
+  Motion motion;
+  for (int row = 0; row < 3; ++row) {
+    for (int column = 0; column < 3; ++column) motion.R[row][column] = T.at(row, column);
+    motion.t[row] = T.at(row, 3);
+  }
+  return motion;
 }
 
-// A Linearization, checked. It holds the arrays.
-struct GivenLinearization {
-  explicit GivenLinearization(const py::object& at)
-      : brightness(member(at, "brightness")), depth(member(at, "depth")), layers(member(at, "layers")) {
+py::array_t<double> array_of(const Motion& motion) {
+  py::array_t<double> T({4, 4});
+  auto entries = T.mutable_unchecked<2>();
+  for (int row = 0; row < 3; ++row) {
+    for (int column = 0; column < 3; ++column) entries(row, column) = motion.R[row][column];
+    entries(row, 3) = motion.t[row], entries(3, row) = 0.0;
+  }
+  entries(3, 3) = 1.0;
+  return T;
+}
+
+// The images of a Linearization or a Descent, checked. It holds the arrays.
+struct GivenImages {
+  explicit GivenImages(const Given& at)
+      : brightness(at.member("brightness")), depth(at.member("depth")), layers(at.member("layers")) {
     const GivenLevel level = level_of(brightness, depth);
     images.brightness = level.brightness, images.depth = level.depth;
     images.layers = values<float>(layers, "layers", {level.size.height, level.size.width, kLayers});
-    images.camera = camera_of(member(at, "camera"), level.size);
-    images.color_motion = pose_of(member(at, "color_motion"), "color_motion");
-    images.depth_motion = pose_of(member(at, "depth_motion"), "depth_motion");
-    AlignmentSettings& settings = images.settings;
-    settings.gain = number(at, "gain"), settings.bias = number(at, "bias");
-    const py::object velocity = member(at, "velocity");
-    std::copy_n(values<float>(velocity, "velocity", {6}), 6, settings.velocity);
-    const py::object readout = member(at, "readout");
-    std::copy_n(values<float>(readout, "readout", {6}), 6, images.readout);
-    settings.photometric_scale = number(at, "photometric_scale"), settings.depth_scale = number(at, "depth_scale");
-    settings.max_depth_ratio = number(at, "max_depth_ratio");
+    images.camera = camera_of(at.member("camera"), level.size);
+    images.settings.max_depth_ratio = at.number("max_depth_ratio");
   }
 
   py::object brightness, depth, layers;
   Aligned images{};
+};
+
+struct GivenLinearization : GivenImages {
+  explicit GivenLinearization(const py::object& object) : GivenLinearization(Given{object, "at", "a Linearization"}) {}
+  explicit GivenLinearization(const Given& at) : GivenImages(at) {
+    images.color_motion = pose_of(at.member("color_motion"), "color_motion");
+    images.depth_motion = pose_of(at.member("depth_motion"), "depth_motion");
+    AlignmentSettings& settings = images.settings;
+    settings.gain = at.number("gain"), settings.bias = at.number("bias");
+    at.copy("velocity", settings.velocity, 6), at.copy("readout", images.readout, 6);
+    settings.photometric_scale = at.number("photometric_scale"), settings.depth_scale = at.number("depth_scale");
+  }
 };
 
 LinearSystem linearize(Aligner& aligner, const py::object& at, float inlier_color, float inlier_depth) {
@@ -228,6 +268,52 @@ LinearSystem linearize(Aligner& aligner, const py::object& at, float inlier_colo
   system.seen = sums.seen, system.agreeing = sums.agreeing;
   system.photometric_median = result.photometric_median, system.depth_median = result.depth_median;
   return system;
+}
+
+// A Descent, checked.
+struct GivenDescent : GivenImages {
+  explicit GivenDescent(const Given& task) : GivenImages(task) {
+    descent.images = images;
+    const py::object predicted = task.member("predicted_motion");
+    descent.is_motion_known = !predicted.is_none();
+    if (descent.is_motion_known) descent.predicted_motion = motion_of(predicted, "predicted_motion");
+    const Given pace{task.member("pace"), "pace", "a Pace"};
+    descent.pace.num_frames = pace.number<int>("num_frames");
+    pace.copy("expected", descent.pace.expected, 6);
+    descent.pace.limit_m = pace.number<double>("limit_m"), descent.pace.limit_rad = pace.number<double>("limit_rad");
+    if (!(descent.pace.num_frames > 0 && descent.pace.limit_m > 0 && descent.pace.limit_rad > 0))
+      throw py::value_error("num_frames, limit_m and limit_rad of pace are expected to be greater than 0");
+    task.copy("mean", descent.mean, kAllUnknowns), task.copy("information", descent.information, kAllUnknowns);
+    task.copy("scale_factors", descent.scale_factors, 2);
+    task.copy("is_free", descent.is_free, kAllUnknowns);
+    descent.iterations = task.number<int>("iterations"), descent.small_step = task.number<double>("small_step");
+  }
+
+  Descent descent{};
+};
+
+AlignmentState state_of(const Given& start) {
+  AlignmentState state{};
+  state.depth_motion = motion_of(start.member("depth_motion"), "depth_motion");
+  state.gain = start.number<double>("gain"), state.bias = start.number<double>("bias");
+  state.time_offset = start.number<double>("time_offset"), state.readout = start.number<double>("readout");
+  start.copy("velocity", state.velocity, 6), start.copy("scales", state.scales, 2);
+  return state;
+}
+
+// Returns a state of the class of the start.
+py::object descend_from(Aligner& aligner, const py::object& task, const py::object& start) {
+  const GivenDescent given(Given{task, "task", "a Descent"});
+  AlignmentState state = state_of(Given{start, "start", "an AlignmentState"});
+  {
+    py::gil_scoped_release release;
+    state = descend(aligner, given.descent, state);
+  }
+  using namespace py::literals;
+  return py::type::of(start)("depth_motion"_a = array_of(state.depth_motion), "gain"_a = state.gain,
+                             "bias"_a = state.bias, "time_offset"_a = state.time_offset,
+                             "velocity"_a = py::array_t<double>(6, state.velocity), "readout"_a = state.readout,
+                             "scales"_a = py::array_t<double>(2, state.scales));
 }
 
 // Aligner::Evidence as Python sees it.
@@ -339,7 +425,8 @@ void bind_engine(py::module_& module) {
       .def("fit", &fit, py::kw_only(), py::arg("means"), py::arg("log_scales"), py::arg("logit_opacities"),
            py::arg("rgb"), py::arg("bounds"), py::arg("moments"), py::arg("steps"), py::arg("rates"),
            py::arg("T_cam_world"), py::arg("camera"), py::arg("target_rgb"), py::arg("target_depth"),
-           py::arg("color_weight"), py::arg("depth_weight"), py::arg("color_limit"), py::arg("depth_limit"));
+           py::arg("color_weight"), py::arg("depth_weight"), py::arg("color_limit"), py::arg("depth_limit"),
+           py::arg("enough"));
 }
 
 void bind_aligner(py::module_& module) {
@@ -365,6 +452,7 @@ void bind_aligner(py::module_& module) {
       .def(py::init([](int threads) { return std::make_unique<Aligner>(checked_threads(threads)); }),
            py::arg("threads"))
       .def("linearize", &linearize, py::arg("at"), py::kw_only(), py::arg("inlier_color"), py::arg("inlier_depth"))
+      .def("descend", &descend_from, py::arg("task"), py::arg("start"))
       .def("evidence", &evidence, py::arg("at"), py::kw_only(), py::arg("max_depth_error"), py::arg("step"))
       .def("halve", &halve, py::arg("brightness"), py::arg("depth"), py::arg("max_step"))
       .def("frame_images", &frame_images, py::arg("rgb8"), py::arg("depth"), py::arg("max_gap"), py::arg("max_step"))

@@ -84,6 +84,7 @@ struct Target {
   const float* depth;       // [H, W] metres, 0 = no reading, negative = the pixel is not compared
   float color_weight, depth_weight;
   float color_limit, depth_limit;  // up to here Huber's loss is quadratic
+  float enough;                    // tiles with less loss per pixel give no gradients
 };
 
 // Adam (Kingma and Ba 2015) with Nesterov's momentum (Dozat 2016). A Gaussian's values in this order: mean, log scale,

@@ -139,6 +139,10 @@ static inline int columns_of(const TileList& tile, const Camera& camera) {
   return camera.width - tile.x < kTile ? camera.width - tile.x : kTile;
 }
 
+static inline int rows_in(const TileList& tile, const Camera& camera) {
+  return camera.height - tile.y < kTile ? camera.height - tile.y : kTile;
+}
+
 static inline Lanes load_row(const float* plane, const TileList& tile, const Camera& camera, int row) {
   if (tile.y + row >= camera.height) return Lanes{};
   const float* from = plane + std::size_t(tile.y + row) * camera.width + tile.x;
@@ -490,6 +494,7 @@ static double fit(const TileList& tile, const Splat* splats, const Camera& camer
   double loss = 0.0;
   PixelGradients rows[kGroups];
   for (int i = 0; i < kGroups; ++i) loss += start(rows[i], pixels[i], tile, camera, kRows * i, to);
+  if (loss < double(target.enough) * (columns_of(tile, camera) * rows_in(tile, camera))) return loss;
   const RowNumbers numbers;
   for (std::size_t k = 0; k < count; ++k) {
     const std::uint32_t member = tile.splats[k];

@@ -22,7 +22,7 @@ READERS = {
     'record3d': 'splatam_core.datasets.record3d',
     'icl': 'splatam_core.datasets.icl',
     'folder': 'splatam_core.datasets.folder',
-    'rosbag': 'splatam_core.datasets.bag.sequence',
+    'rosbag': 'splatam_core.datasets.bag.format',
 }
 """Maps the name of a format to the module that exports it as ``FORMAT``; modules are imported when needed."""
 

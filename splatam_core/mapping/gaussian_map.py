@@ -296,7 +296,7 @@ class GaussianMap:
     def _reserve(self) -> None:
         if self._size <= len(self._storage['means']):
             return
-        capacity = self._size + self._size // 2
+        capacity = self._size + self._size // 4
         for name, old in self._storage.items():
             new = old.new_empty(capacity, *old.shape[1:])
             new[: len(old)] = old

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from splatam_core.images.view import unproject
 from splatam_core.mapping.ghosts import without
 from splatam_core.mapping.posed import PosedFrame, PosedView
 
+_TRIES = 2  # pixels drawn for each one with a reading
 _BATCH = 64  # keyframes whose overlap is computed at once; more would not fit a core's cache
 
 
@@ -192,10 +193,15 @@ def _seen(
 def sample_points(posed: PosedView, count: int, rng: np.random.Generator) -> Tensor:
     """Returns [count, 3] world points of random pixels with a reading, drawn with replacement; [0, 3] without any."""
     depth = posed.view.depth
-    with_reading = np.flatnonzero(posed.view.valid.numpy())  # eight times as fast as torch.nonzero
-    if len(with_reading) == 0:
-        return depth.new_empty(0, 3)
-    drawn = torch.from_numpy(with_reading[rng.integers(len(with_reading), size=count)])
+    readings = depth.numpy().reshape(-1)
+    found = rng.integers(len(readings), size=_TRIES * count)
+    found = found[readings[found] > 0][:count]
+    if len(found) < count:  # there are too few readings to come upon them
+        with_reading = np.flatnonzero(readings > 0)
+        if len(with_reading) == 0:
+            return depth.new_empty(0, 3)
+        found = with_reading[rng.integers(len(with_reading), size=count)]
+    drawn = torch.from_numpy(found)
     v, u = drawn // depth.shape[1], drawn % depth.shape[1]
     points = unproject(posed.view.camera, u, v, depth[v, u])
     return (points - posed.T_cam_world[:3, 3]) @ posed.T_cam_world[:3, :3]
@@ -235,10 +241,19 @@ def _may_see(points: NDArray[np.float32], camera: PinholeCamera, T_cam_world: ND
     return seen
 
 
-def views_to_fit(window: Sequence[PosedView], num_steps: int, config: SlamConfig, rng: np.random.Generator) -> Iterator[PosedView]:
-    """Yields the view of each optimization step: drawn at random from the window, at half size where the rhythm says so."""
+def views_to_fit(
+    window: Sequence[PosedView], steps: Iterable[int], config: SlamConfig, rng: np.random.Generator
+) -> Iterator[PosedView]:
+    """Yields the view of each optimization step: drawn at random from the window, at half size where the rhythm says so.
+
+    Args:
+        window: the views.
+        steps: numbers of the steps, counted over all frames.
+        config: every setting.
+        rng: draws them.
+    """
     half_size_every = config.mapping.half_size_every
-    for step in range(num_steps):
+    for step in steps:
         posed = draw(window, config.keyframes, rng)
         yield posed.half_size() if half_size_every and step % half_size_every == half_size_every - 1 else posed
 

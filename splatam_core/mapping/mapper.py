@@ -142,7 +142,7 @@ class Mapper:
         """Fits the map to the window, one random view a step, and prunes."""
         if plan.steps is None or not window:
             return
-        views = views_to_fit(window, plan.steps, self._config, self.rng)
+        views = views_to_fit(window, range(plan.first_step, plan.first_step + plan.steps), self._config, self.rng)
         self._optimizer.fit(self.map, takewhile(lambda _: not self._stop(), views), self.scene_radius)
 
     def retract(self, first: int) -> int:

@@ -15,6 +15,7 @@ class MappingPlan:
         is_used: whether the frame may change the map.
         densifies: whether it adds Gaussians.
         steps: optimization steps; None where the map is not refined on this frame.
+        first_step: how many steps the frames before it had.
         is_keyframe: whether it is kept.
     """
 
@@ -22,6 +23,7 @@ class MappingPlan:
     densifies: bool = False
     steps: int | None = None
     is_keyframe: bool = False
+    first_step: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +60,13 @@ class MappingSchedule:
         is_mapped = remainder == 0
         densifies = num_mapped % densification.every == 0 or visible_fraction < densification.min_visible_fraction
         steps = mapping.iterations + (mapping.first_iterations if index == 0 else 0)
-        return MappingPlan(True, is_mapped and densifies, steps if is_mapped else None, self.is_keyframe(index))
+        return MappingPlan(
+            is_used=True,
+            densifies=is_mapped and densifies,
+            steps=steps if is_mapped else None,
+            is_keyframe=self.is_keyframe(index),
+            first_step=num_mapped * mapping.iterations + (mapping.first_iterations if index > 0 else 0),
+        )
 
     def is_keyframe(self, index: int) -> bool:
         """Whether a frame, counted from 0 among those not held out, is kept."""

@@ -41,6 +41,9 @@ FIT_BETA_2 = 0.9
 COLOR_LIMIT, DEPTH_LIMIT_M = 0.1, 0.02
 """Of ``fit``: limits of Huber's loss, quadratic below and linear above."""
 
+FIT_TILE = 8
+"""Of ``fit``: side in pixels of the squares that are fitted or left as they are."""
+
 NOT_COMPARED = -1.0
 """Depth in a ``Target`` of pixels of which neither colour nor depth is compared."""
 
@@ -199,6 +202,8 @@ class Target:
         T_cam_world: [4, 4] float32.
         color_weight: weight of the mean Huber loss of colour, over pixels and channels, those that are not compared included.
         depth_weight: weight of the mean Huber loss of depth_acc, over readings.
+        enough: squares of ``FIT_TILE`` pixels a side, counted from the upper left pixel, give no gradients where the mean loss of
+            their pixels is less. The loss of a view is the mean of that of its pixels. 0 = all do.
     """
 
     camera: PinholeCamera
@@ -207,6 +212,7 @@ class Target:
     T_cam_world: Tensor
     color_weight: float
     depth_weight: float
+    enough: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

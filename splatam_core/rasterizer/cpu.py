@@ -82,7 +82,7 @@ class CpuRasterizer:
         check_isotropic(gaussians)
         _check(gaussians, target.T_cam_world)
         _check_fit(gaussians, moments, target)
-        camera, readings = target.camera, max(1, int(torch.count_nonzero(target.depth > 0)))
+        camera, readings = target.camera, max(1, int(np.count_nonzero(target.depth.numpy() > 0)))
         with native_errors():
             return self._engine.fit(
                 **_arrays(gaussians),
@@ -97,6 +97,7 @@ class CpuRasterizer:
                 depth_weight=target.depth_weight / readings,
                 color_limit=COLOR_LIMIT,
                 depth_limit=DEPTH_LIMIT_M,
+                enough=target.enough / (camera.width * camera.height),
             )
 
 

@@ -6,6 +6,7 @@ import math
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from splatam_core.errors import RasterizerError
 from splatam_core.geometry.camera import PinholeCamera
@@ -16,6 +17,7 @@ from splatam_core.rasterizer.base import (
     DEPTH_LIMIT_M,
     EPSILON,
     FIT_BETA_2,
+    FIT_TILE,
     HUGE,
     MAX_ALPHA,
     MIN_ALPHA,
@@ -64,8 +66,9 @@ class ReferenceRasterizer:
         values = [gaussians.means, gaussians.log_scales, gaussians.logit_opacities[:, None], gaussians.rgb]
         packed = torch.cat(values, dim=1).detach().requires_grad_()  # [N, 8]
         means, log_scales, logits, rgb = packed.split([3, 1, 1, 3], dim=1)
-        loss = _loss(self.render(Gaussians(means, log_scales, logits[:, 0], rgb), target.camera, target.T_cam_world), target)
-        (gradient,) = torch.autograd.grad(loss, packed)
+        losses = _losses(self.render(Gaussians(means, log_scales, logits[:, 0], rgb), target.camera, target.T_cam_world), target)
+        loss = losses.mean().item()
+        (gradient,) = torch.autograd.grad((losses * ~_are_fitted_well(losses.detach(), target.enough)).mean(), packed)
         seen = (gradient != 0).any(dim=1) & (gradient.abs() < math.sqrt(HUGE)).all(dim=1)
         gradient = gradient[seen]
         moments.steps[seen] += (moments.steps[seen] < 255).to(torch.uint8)
@@ -78,14 +81,21 @@ class ReferenceRasterizer:
         move = rate * ahead / ((second / (1 - FIT_BETA_2**step)).sqrt() + EPSILON)
         for value, moved in zip(values, move.split([3, 1, 1, 3], dim=1), strict=True):
             value[seen] -= moved.to(value.dtype)
-        return loss.item()
+        return loss
 
 
-def _loss(render: Render, target: Target) -> Tensor:
-    color = (_huber(render.rgb - target.rgb8.permute(2, 0, 1) / 255, COLOR_LIMIT) * (target.depth >= 0)).mean()
+def _losses(render: Render, target: Target) -> Tensor:
+    """Returns [H, W] the loss of each pixel, whose mean is that of the view."""
+    color = (_huber(render.rgb - target.rgb8.permute(2, 0, 1) / 255, COLOR_LIMIT) * (target.depth >= 0)).mean(dim=0)
     read = target.depth > 0
-    depth = (_huber(render.depth_acc - target.depth, DEPTH_LIMIT_M) * read).sum() / read.sum().clamp(min=1)
+    depth = _huber(render.depth_acc - target.depth, DEPTH_LIMIT_M) * read * (read.numel() / read.sum().clamp(min=1))
     return target.color_weight * color + target.depth_weight * depth
+
+
+def _are_fitted_well(losses: Tensor, enough: float) -> Tensor:
+    """Returns [H, W] which pixels are in a square of ``FIT_TILE`` pixels a side whose mean loss is less than enough."""
+    tiles = functional.avg_pool2d(losses[None, None], FIT_TILE, ceil_mode=True, count_include_pad=False) < enough
+    return tiles[0, 0].repeat_interleave(FIT_TILE, 0).repeat_interleave(FIT_TILE, 1)[: losses.shape[0], : losses.shape[1]]
 
 
 def _huber(residual: Tensor, limit: float) -> Tensor:

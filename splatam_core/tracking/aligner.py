@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.se3 import Matrix
+from splatam_core.tracking.motion import Pace
 
 Array = NDArray[np.float32]
 ImageT = TypeVar('ImageT', Array, Tensor)
 OtherT = TypeVar('OtherT', Array, Tensor)
+
+_FIRST_SCALES = 0.1, 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +61,102 @@ class Linearization(Generic[ImageT]):
         """Returns the same with each of the images converted."""
         given = {field.name: getattr(self, field.name) for field in fields(self)}
         return Linearization(**given | {name: convert(given[name]) for name in ('brightness', 'depth', 'layers')})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AlignmentState:
+    """The estimate that alignment refines.
+
+    Attributes:
+        depth_motion: [4, 4] from the reference's camera to the frame's camera at the depth image's time.
+        gain: brightness of the frame = gain * brightness of the reference + bias.
+        bias: see gain.
+        time_offset: frame intervals by which the colour image is later than the depth image.
+        velocity: [6] twist of the camera per frame interval.
+        readout: fraction of the interval from the first row of an image to its last.
+        scales: [2] of the residuals: of brightness in [0, 1], and of depth relative to the depth.
+    """
+
+    depth_motion: Matrix
+    gain: float = 1.0
+    bias: float = 0.0
+    time_offset: float = 0.0
+    velocity: Matrix = field(default_factory=lambda: np.zeros(6))
+    readout: float = 0.0
+    scales: Matrix = field(default_factory=lambda: np.array(_FIRST_SCALES))
+
+    @property
+    def color_motion(self) -> Matrix:
+        """[4, 4] from the reference's camera to the frame's camera at the colour image's time."""
+        return se3.exp(self.time_offset * self.velocity) @ self.depth_motion if self.time_offset else self.depth_motion
+
+    def moved(self, step: Matrix) -> AlignmentState:
+        """Returns the state after a step [10] of the unknowns."""
+        return AlignmentState(
+            depth_motion=se3.exp(step[:6]) @ self.depth_motion,
+            gain=float(self.gain + step[6]),
+            bias=float(self.bias + step[7]),
+            time_offset=float(self.time_offset + step[8]),
+            velocity=self.velocity,
+            readout=float(self.readout + step[9]),
+            scales=self.scales,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Descent(Generic[ImageT]):
+    """What is aligned at one level of a pyramid, and what is known about it before.
+
+    There are ten unknowns: the twist of the camera (6), gain and bias of the brightness, time offset and readout.
+
+    Attributes:
+        camera: the pinhole of reference and frame.
+        brightness: [H, W] of the reference.
+        depth: [H, W] of the reference.
+        layers: [H, W, C] of the frame, see ``Aligner.layers``.
+        max_depth_ratio: see ``Linearization``.
+        predicted_motion: [4, 4] from the camera at the last pose to the reference's; None if that is not known.
+        pace: how the camera is expected to move from frame to frame; counts where the predicted motion is known.
+        mean: [10] of the unknowns; 0 for the twist, which is relative to the state.
+        information: [10] inverse variances; those of twist, gain and bias of a step.
+        is_free: [10] bool, which of the unknowns are solved for.
+        scale_factors: [2] by which the scales of the residuals of brightness and depth are multiplied: roots of inverse weights.
+        iterations: largest number of steps.
+        small_step: m and rad: a smaller step is the last.
+    """
+
+    camera: PinholeCamera
+    brightness: ImageT
+    depth: ImageT
+    layers: ImageT
+    max_depth_ratio: float
+    predicted_motion: Matrix | None
+    pace: Pace
+    mean: Matrix
+    information: Matrix
+    is_free: NDArray[np.bool_]
+    scale_factors: Matrix
+    iterations: int
+    small_step: float
+
+    def at(self, state: AlignmentState) -> Linearization[ImageT]:
+        """Returns a state as the estimate at which the residuals are linearised."""
+        photometric_scale, depth_scale = (state.scales * self.scale_factors).tolist()
+        return Linearization(
+            camera=self.camera,
+            brightness=self.brightness,
+            depth=self.depth,
+            layers=self.layers,
+            color_motion=state.color_motion.astype(np.float32),
+            depth_motion=state.depth_motion.astype(np.float32),
+            velocity=state.velocity.astype(np.float32),
+            gain=state.gain,
+            bias=state.bias,
+            photometric_scale=photometric_scale,
+            depth_scale=depth_scale,
+            max_depth_ratio=self.max_depth_ratio,
+            readout=(state.readout * state.velocity).astype(np.float32),
+        )
 
 
 class LinearSystem(Protocol):
@@ -186,6 +286,9 @@ class Aligner(Protocol[ImageT]):
             inlier_color: largest residual of brightness of an inlier.
             inlier_depth: largest residual of depth of an inlier.
         """
+
+    def descend(self, task: Descent[ImageT], start: AlignmentState) -> AlignmentState:
+        """Returns the state after steps of Gauss-Newton from a start, as ``tracking.descent`` takes them."""
 
     def evidence(self, at: Linearization[ImageT], *, max_depth_error: float, step: int) -> EvidenceSums:
         """Sums what the residuals at the end of an alignment say about the pose.

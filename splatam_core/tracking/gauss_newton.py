@@ -2,91 +2,42 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from splatam_core.config import TrackingConfig
-from splatam_core.geometry import se3
 from splatam_core.geometry.se3 import Matrix
-from splatam_core.tracking.aligner import Aligner, Array, Linearization, LinearSystem
+from splatam_core.tracking.aligner import Aligner, AlignmentState, Descent, LinearSystem
+from splatam_core.tracking.descent import READOUT, TIME_OFFSET, Equations
 from splatam_core.tracking.evidence import Evidence, Knowns, max_depth_error, step_of, weigh
 from splatam_core.tracking.motion import Pace
 from splatam_core.tracking.pyramid import EDGE, Level
 from splatam_core.tracking.readout import ReadoutSeen
 from splatam_core.tracking.time_offset import TimeOffset
 
-_MIN_POINTS = 50
 _SMALL_STEP = 1e-4  # m, rad: converged; a step is a fraction of the one before
 _SMALL_COARSE_STEP = 1e-3  # at a level from which a finer one goes on
-_FIRST_SCALES = 0.1, 0.02  # of residuals: brightness in [0, 1], relative depth
-_MIN_SCALES = 0.004, 0.001  # no sensor is better
-_MAD_TO_DEVIATION = 1.4826  # standard deviation over median absolute deviation, for a normal distribution
 _LEAST_WEIGHT = 1e-6
-_TWIST, _GAIN_AND_BIAS, _TIME_OFFSET, _READOUT = range(6), range(6, 8), range(8, 9), range(9, 10)  # the unknowns
+_NUM_UNKNOWNS, _TWIST, _GAIN_AND_BIAS = 10, range(6), range(6, 8)
 _ANY_PACE = Pace()
 _PRIOR = np.array([0.3] * 6 + [0.1] * 2) ** -2  # variance^-1 of a step: m and rad; gain, bias
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AlignmentState:
-    """The estimate that alignment refines.
+class _Known:
+    """What is known before a frame is aligned.
 
     Attributes:
-        depth_motion: [4, 4] from the reference's camera to the frame's camera at the depth image's time.
-        gain: brightness of the frame = gain * brightness of the reference + bias.
-        bias: see gain.
-        time_offset: frame intervals by which the colour image is later than the depth image.
-        velocity: [6] twist of the camera per frame interval.
-        readout: fraction of the interval from the first row of an image to its last.
-    """
-
-    depth_motion: Matrix
-    gain: float = 1.0
-    bias: float = 0.0
-    time_offset: float = 0.0
-    velocity: Matrix = field(default_factory=lambda: np.zeros(6))
-    readout: float = 0.0
-
-    @property
-    def color_motion(self) -> Matrix:
-        """[4, 4] from the reference's camera to the frame's camera at the colour image's time."""
-        return se3.exp(self.time_offset * self.velocity) @ self.depth_motion if self.time_offset else self.depth_motion
-
-    def moved(self, step: Matrix) -> AlignmentState:
-        """Returns the state after a step [10] of the unknowns."""
-        return AlignmentState(
-            depth_motion=se3.exp(step[:6]) @ self.depth_motion,
-            gain=self.gain + step[6],
-            bias=self.bias + step[7],
-            time_offset=self.time_offset + step[8],
-            velocity=self.velocity,
-            readout=self.readout + step[9],
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pair:
-    """What is aligned at one level.
-
-    Attributes:
-        reference: the render.
-        layers: of the frame, see ``Aligner.layers``.
-        depth_share: of the frame, see ``Level``.
         predicted_motion: [4, 4] from the camera at the last pose to the render's; None if that is not known.
-        time_offset: between colour and depth, before this frame.
+        time_offset: between colour and depth.
         pace: how the camera is expected to move from frame to frame.
-        readout: how long reading an image takes, before this frame; None where it is not estimated.
+        readout: how long reading an image takes; None where it is not estimated.
     """
 
-    reference: Level
-    layers: Array | Tensor
-    depth_share: float
     predicted_motion: Matrix | None
     time_offset: TimeOffset
     pace: Pace
@@ -128,8 +79,8 @@ class GaussNewton:
         self._aligner = aligner
         self._config = config
         align = config.align
-        exposure, time_offset = _GAIN_AND_BIAS if align.exposure else (), _TIME_OFFSET if align.time_offset else ()
-        self._free = [*_TWIST, *exposure, *time_offset]  # the unknowns to solve for
+        exposure, time_offset = _GAIN_AND_BIAS if align.exposure else (), (TIME_OFFSET,) if align.time_offset else ()
+        self._free = [*_TWIST, *exposure, *time_offset]  # the unknowns to solve for, but the readout
         self._estimates_time_offset = align.time_offset
         self._estimates_readout = align.rolling_shutter
 
@@ -162,159 +113,64 @@ class GaussNewton:
         readout = pace.readout if self._estimates_readout and predicted_motion is not None else None
         if readout is not None:
             state = replace(state, readout=readout.mean)
-        scales = _FIRST_SCALES
+        known = _Known(predicted_motion, time_offset, pace, readout)
         for reference, frame in zip(reversed(references), reversed(frames), strict=True):
-            layers = self._aligner.layers(frame.brightness, frame.depth, EDGE)
-            pair = _Pair(
-                reference=reference,
-                layers=layers,
-                depth_share=frame.depth_share,
-                predicted_motion=predicted_motion,
-                time_offset=time_offset,
-                pace=pace,
-                readout=readout,
-            )
-            small_step = _SMALL_STEP if reference is references[0] else _SMALL_COARSE_STEP
-            state, scales = self._iterate(pair, state, scales, small_step)
-        system = self._linearize(pair, state, scales)
-        after, equations, free = time_offset, _Equations.of(system, state, pair), self._unknowns(pair)
+            task = self._task(reference, frame, known, _SMALL_STEP if reference is references[0] else _SMALL_COARSE_STEP)
+            state = self._aligner.descend(task, state)
+        system = self._linearize(task, state)
+        after, equations = time_offset, Equations.of(system, state, task)
         if self._estimates_time_offset:
-            after = time_offset.updated(state.time_offset, equations.information(_TIME_OFFSET[0], free))
-        at_start = self._linearize(pair, start, scales)
+            after = time_offset.updated(state.time_offset, equations.information(TIME_OFFSET))
+        start = replace(start, scales=state.scales)
+        at_start = self._linearize(task, start)
         if not _is_better(at_start, system):
-            return Alignment(start, at_start, time_offset, partial(self._weigh, pair, start, scales))
-        return Alignment(state, system, after, partial(self._weigh, pair, state, scales), _seen(equations, state, pair, free))
+            return Alignment(start, at_start, time_offset, partial(self._weigh, task, start, known))
+        return Alignment(state, system, after, partial(self._weigh, task, state, known), _seen(equations, state, readout))
 
-    def _iterate(
-        self, pair: _Pair, state: AlignmentState, scales: tuple[float, float], small_step: float
-    ) -> tuple[AlignmentState, tuple[float, float]]:
-        """Takes steps at one level until one is small, m and rad. Returns the state and the scales of the residuals."""
-        for _ in range(self._config.iterations):
-            if pair.predicted_motion is not None:
-                state = replace(state, velocity=pair.pace.twist(state.depth_motion @ pair.predicted_motion))
-            system = self._linearize(pair, state, scales)
-            scales = _scales(system)
-            step = _Equations.of(system, state, pair).step(self._unknowns(pair))
-            if step is None:
-                break
-            state = state.moved(step)
-            if np.abs(step[:6]).max() < small_step:
-                break
-        return state, scales
-
-    def _linearize(self, pair: _Pair, state: AlignmentState, scales: tuple[float, float]) -> LinearSystem:
-        config = self._config
-        at = self._at(pair, state, scales)
-        return self._aligner.linearize(at, inlier_color=config.inlier_color, inlier_depth=config.inlier_depth)
-
-    def _at(self, pair: _Pair, state: AlignmentState, scales: tuple[float, float]) -> Linearization[Any]:
-        reference = pair.reference
-        photometric_scale, depth_scale = self._weighted(pair, scales)
-        return Linearization(
+    def _task(self, reference: Level, frame: Level, known: _Known, small_step: float) -> Descent[Any]:
+        """Returns what is done at one level."""
+        config, readout, is_free = self._config, known.readout or ReadoutSeen(), np.zeros(_NUM_UNKNOWNS, dtype=np.bool_)
+        is_free[self._free], is_free[READOUT] = True, known.readout is not None
+        # What lies between readings repeats their errors, and adds some.
+        weights = np.array([config.color_weight, config.depth_weight * frame.depth_share])
+        return Descent(
             camera=reference.camera,
             brightness=reference.brightness,
             depth=reference.depth,
-            layers=pair.layers,
-            color_motion=state.color_motion.astype(np.float32),
-            depth_motion=state.depth_motion.astype(np.float32),
-            velocity=state.velocity.astype(np.float32),
-            gain=state.gain,
-            bias=state.bias,
-            photometric_scale=photometric_scale,
-            depth_scale=depth_scale,
+            layers=self._aligner.layers(frame.brightness, frame.depth, EDGE),
             max_depth_ratio=2 * EDGE,
-            readout=(state.readout * state.velocity).astype(np.float32),
+            predicted_motion=known.predicted_motion,
+            pace=known.pace,
+            mean=np.array([0.0] * 6 + [1.0, 0.0, known.time_offset.mean, readout.mean]),
+            information=np.array([*_PRIOR, known.time_offset.information, readout.information]),
+            is_free=is_free,
+            scale_factors=1 / np.sqrt(np.maximum(weights, _LEAST_WEIGHT)),
+            iterations=config.iterations,
+            small_step=small_step,
         )
 
-    def _unknowns(self, pair: _Pair) -> list[int]:
-        """Returns the indices of what is solved for."""
-        return self._free if pair.readout is None else [*self._free, *_READOUT]
+    def _linearize(self, task: Descent[Any], state: AlignmentState) -> LinearSystem:
+        config = self._config
+        return self._aligner.linearize(task.at(state), inlier_color=config.inlier_color, inlier_depth=config.inlier_depth)
 
-    def _weighted(self, pair: _Pair, scales: tuple[float, float]) -> tuple[float, float]:
-        """Returns the scales of the residuals of brightness and depth, divided by the roots of their weights."""
-        # What lies between readings repeats their errors, and adds some.
-        weights = self._config.color_weight, self._config.depth_weight * pair.depth_share
-        color, depth = (scale / math.sqrt(max(weight, _LEAST_WEIGHT)) for scale, weight in zip(scales, weights, strict=True))
-        return color, depth
-
-    def _weigh(self, pair: _Pair, state: AlignmentState, scales: tuple[float, float]) -> Evidence:
-        at = self._at(pair, state, scales)
+    def _weigh(self, task: Descent[Any], state: AlignmentState, known: _Known) -> Evidence:
+        at = task.at(state)
         sums = self._aligner.evidence(at, max_depth_error=max_depth_error(at.depth_scale), step=step_of(at.camera))
-        prior = np.append(_PRIOR, pair.time_offset.information)
-        return weigh(sums, Knowns(at.camera, state.velocity, prior, pair.time_offset.inflation, self._free))
+        prior = task.information[:READOUT]
+        return weigh(sums, Knowns(at.camera, state.velocity, prior, known.time_offset.inflation, self._free))
 
 
-def _seen(equations: _Equations, state: AlignmentState, pair: _Pair, free: list[int]) -> ReadoutSeen | None:
+def _seen(equations: Equations, state: AlignmentState, known: ReadoutSeen | None) -> ReadoutSeen | None:
     """Returns what a frame alone tells about the readout; None if nothing."""
-    if pair.readout is None or not (information := equations.information(_READOUT[0], free)) > 0:
+    if known is None or not (information := equations.information(READOUT)) > 0:
         return None
-    return ReadoutSeen(state.readout + (state.readout - pair.readout.mean) * pair.readout.information / information, information)
+    return ReadoutSeen(state.readout + (state.readout - known.mean) * known.information / information, information)
 
 
 def _is_better(start: LinearSystem, found: LinearSystem) -> bool:
     """Returns whether an estimate has lower cost than the start. A point that is not seen costs the average of the start's."""
     unseen_cost = start.cost / max(1, start.seen)
     return 2 * found.seen > start.seen and _total_cost(found, unseen_cost) < _total_cost(start, unseen_cost)
-
-
-def _scales(system: LinearSystem) -> tuple[float, float]:
-    """Returns the scales of the residuals of brightness and depth, from their medians."""
-    return (
-        max(_MIN_SCALES[0], _MAD_TO_DEVIATION * system.photometric_median),
-        max(_MIN_SCALES[1], _MAD_TO_DEVIATION * system.depth_median),
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Equations:
-    """The normal equations of all ten unknowns, the readout the last of them, without what is known before.
-
-    Attributes:
-        H: [10, 10].
-        g: [10].
-        prior: [10] inverse variances.
-        off: [10] by how much the state differs from what is known before.
-        num_seen: number of points.
-    """
-
-    H: Matrix
-    g: Matrix
-    prior: Matrix
-    off: Matrix
-    num_seen: int
-
-    @classmethod
-    def of(cls, system: LinearSystem, state: AlignmentState, pair: _Pair) -> _Equations:
-        """Returns those of a system. A point moves with the readout as with the time offset, times when its row is read."""
-        H, g, turn = np.zeros((10, 10)), np.zeros(10), state.velocity
-        H[:9, :9], g[:9] = system.H, system.g
-        readout = pair.readout or ReadoutSeen()
-        if pair.readout is not None:
-            H[:9, 9] = H[9, :9] = system.H_by_time[:, :6] @ turn
-            H[9, 9] = turn @ system.H_by_time_squared[:6, :6] @ turn
-            g[9] = turn @ system.g_by_time[:6]
-        prior = np.array([*_PRIOR, pair.time_offset.information, readout.information])
-        found = state.gain - 1, state.bias, state.time_offset - pair.time_offset.mean, state.readout - readout.mean
-        return cls(H, g, prior, np.array([0.0] * 6 + [*found]), system.seen)
-
-    def information(self, unknown: int, free: list[int]) -> float:
-        """Returns the inverse variance that the residuals claim for an unknown, the other free ones marginalized."""
-        others, H = [other for other in free if other != unknown], self.H + np.diag(self.prior)
-        return float(self.H[unknown, unknown] - H[unknown, others] @ np.linalg.solve(H[np.ix_(others, others)], H[others, unknown]))
-
-    def step(self, free: list[int]) -> Matrix | None:
-        """Returns the step [10] of the free unknowns that minimises the residuals; None if they do not determine one.
-
-        On a ramp of brightness a shift looks like a change of bias. The priors decide what the residuals leave open.
-        """
-        if self.num_seen < _MIN_POINTS:
-            return None
-        H, g, step = self.H + np.diag(self.prior), self.g + self.prior * self.off, np.zeros(10)
-        try:
-            step[free] = -np.linalg.solve(H[np.ix_(free, free)], g[free])
-        except np.linalg.LinAlgError:
-            return None
-        return step
 
 
 def _total_cost(system: LinearSystem, unseen_cost: float) -> float:

@@ -7,6 +7,7 @@ float32, in an order that the device chooses; those of the native aligner are do
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -16,7 +17,8 @@ from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.filters import brightness, luminance
 from splatam_core.rasterizer import Render
-from splatam_core.tracking.aligner import EvidenceSums, Linearization
+from splatam_core.tracking.aligner import AlignmentState, Descent, EvidenceSums, Linearization
+from splatam_core.tracking.descent import descend
 from splatam_core.tracking.evidence import summed
 
 _UNKNOWNS = 9
@@ -105,6 +107,10 @@ class TorchAligner:
         counts = torch.stack([known, compared, seen, agree]).sum(dim=1)
         system = torch.where(used, jacobian, 0), residuals
         return _summed(system, scales, times, _Counted(counts, _medians(residuals, used), seen))
+
+    def descend(self, task: Descent[Tensor], start: AlignmentState) -> AlignmentState:
+        """See ``Aligner.descend``. Inliers are not counted on the way."""
+        return descend(partial(self.linearize, inlier_color=0.0, inlier_depth=0.0), task, start)
 
     def evidence(self, at: Linearization[Tensor], *, max_depth_error: float, step: int) -> EvidenceSums:
         """See ``Aligner.evidence``. On the host."""

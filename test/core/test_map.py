@@ -43,7 +43,7 @@ def _refine(
     gaussian_map: GaussianMap, window: list[PosedView], rasterizer: Rasterizer, config: SlamConfig, scene_radius: float = 1.0
 ) -> None:
     """Fits a map to a window as the mapper does."""
-    views = views_to_fit(window, config.mapping.iterations, config, np.random.default_rng(0))
+    views = views_to_fit(window, range(config.mapping.iterations), config, np.random.default_rng(0))
     make_optimizer(rasterizer, config.mapping).fit(gaussian_map, views, scene_radius)
 
 
@@ -179,6 +179,14 @@ def test_every_other_step_fits_at_half_size() -> None:
     config = load_config(overrides={'mapping.iterations': 5, 'mapping.optimizer': 'fused', 'mapping.half_size_every': 2})
     _refine(_map(_view()), [PosedView(_view(), EYE)], Watched(1), config)
     assert sizes == [full := (32, 24, 32, 24, 32), half := (16, 12, 16, 12, 16), full, half, full]
+
+
+def test_the_rhythm_of_half_size_goes_on_from_frame_to_frame() -> None:
+    """Else the first of three steps was never at half size."""
+    config = load_config(overrides={'mapping.iterations': 3, 'mapping.first_iterations': 4, 'mapping.every': 2})
+    plans = [MappingSchedule(config).plan(index, 1.0) for index in range(7)]
+    steps = [range(plan.first_step, plan.first_step + plan.steps) for plan in plans if plan.steps is not None]
+    assert [step for of_frame in steps for step in of_frame] == list(range(4 + 4 * 3))
 
 
 class _Listed(CpuRasterizer):

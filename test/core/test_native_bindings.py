@@ -62,6 +62,7 @@ def fit(**changed: object) -> None:
         'bounds': floats(1, 7), 'moments': floats(N, 16), 'steps': np.zeros(N, np.uint8), 'rates': (0.1, 0.1, 0.1, 0.1),
         'T_cam_world': POSE, 'camera': CAMERA, 'target_rgb': np.zeros((HEIGHT, WIDTH, 3), np.uint8),
         'target_depth': floats(HEIGHT, WIDTH), 'color_weight': 1.0, 'depth_weight': 1.0, 'color_limit': 0.1, 'depth_limit': 0.1,
+        'enough': 0.0,
     }  # fmt: skip
     _native.Engine(1).fit(**(arguments | changed))
 
@@ -77,6 +78,22 @@ def linearization(**changed: object) -> Linearization:
 
 def linearize(**changed: object) -> None:
     _native.Aligner(1).linearize(linearization(**changed), inlier_color=0.1, inlier_depth=0.1)
+
+
+def descend(**changed: object) -> None:
+    task = {
+        'camera': CAMERA, 'brightness': floats(HEIGHT, WIDTH), 'depth': floats(HEIGHT, WIDTH), 'layers': floats(HEIGHT, WIDTH, 8),
+        'max_depth_ratio': 0.1, 'predicted_motion': np.eye(4), 'mean': np.zeros(10), 'information': np.ones(10),
+        'is_free': np.ones(10, bool), 'scale_factors': np.ones(2), 'iterations': 2, 'small_step': 1e-4,
+    }  # fmt: skip
+    pace = {'num_frames': 1, 'expected': np.zeros(6), 'limit_m': np.inf, 'limit_rad': np.inf}
+    start = {
+        'depth_motion': np.eye(4), 'gain': 1.0, 'bias': 0.0, 'time_offset': 0.0, 'velocity': np.zeros(6), 'readout': 0.0,
+        'scales': np.ones(2),
+    }  # fmt: skip
+    for name, value in changed.items():
+        next(given for given in (task, pace, start) if name in given)[name] = value
+    _native.Aligner(1).descend(SimpleNamespace(pace=SimpleNamespace(**pace), **task), SimpleNamespace(**start))
 
 
 def evidence(**changed: object) -> None:
@@ -123,6 +140,7 @@ CALLS = {
     | {'pose_gradient': (4, 4), 'images_at_0': IMAGE, 'images_at_1': PLANE, 'image_gradients_at_2': PLANE},
     fit: GAUSSIANS | {'bounds': (1, 7), 'moments': (N, 16), 'target_depth': PLANE},
     linearize: {'brightness': PLANE, 'depth': PLANE, 'layers': (HEIGHT, WIDTH, 8), 'velocity': (6,), 'readout': (6,)},
+    descend: {'brightness': PLANE, 'depth': PLANE, 'layers': (HEIGHT, WIDTH, 8)},
     evidence: {'brightness': PLANE, 'depth': PLANE, 'layers': (HEIGHT, WIDTH, 8), 'velocity': (6,), 'readout': (6,)},
     halve: {'brightness': PLANE, 'depth': PLANE},
     frame_images: {'depth': PLANE},
@@ -193,6 +211,28 @@ def test_what_is_no_linearization_is_refused(call: Callable[..., None], monkeypa
     monkeypatch.setitem(globals(), 'linearization', lambda: SimpleNamespace(brightness=floats(HEIGHT, WIDTH)))
     with pytest.raises(TypeError, match='at has no depth; expected a Linearization'):
         call()
+
+
+@pytest.mark.parametrize(
+    ('name', 'shape'),
+    [('mean', (10,)), ('information', (10,)), ('scale_factors', (2,)), ('expected', (6,)), ('velocity', (6,)), ('scales', (2,)),
+     ('predicted_motion', (4, 4)), ('depth_motion', (4, 4))],
+)  # fmt: skip
+def test_what_a_descent_knows_is_checked(name: str, shape: tuple[int, ...]) -> None:
+    for value in (np.ones(shape, np.float32), np.ones((*shape, 1)), np.ones((shape[0] - 1, *shape[1:])), [1.0], 'text'):
+        with pytest.raises(TypeError, match=f'{name} is .* expected'):
+            descend(**{name: value})
+    descend(predicted_motion=None)
+    for wrong_number in ({'gain': 'text'}, {'iterations': 2.5}, {'num_frames': 'text'}, {'small_step': None}):
+        with pytest.raises(TypeError, match=f'{next(iter(wrong_number))} is no number'):
+            descend(**wrong_number)
+    for impossible in ({'num_frames': 0}, {'limit_m': 0.0}, {'limit_rad': np.nan}):
+        with pytest.raises(ValueError, match='greater than 0'):
+            descend(**impossible)
+    with pytest.raises(TypeError, match='is_free is .* expected'):
+        descend(is_free=np.ones(10))
+    with pytest.raises(TypeError, match='task has no brightness; expected a Descent'):
+        _native.Aligner(1).descend(SimpleNamespace(), SimpleNamespace())
 
 
 def test_a_depth_of_another_size_than_the_image_is_refused() -> None:

@@ -17,7 +17,7 @@ from splatam_core.errors import RasterizerError
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.rasterizer import Gaussians, Moments, Rasterizer, Rates, Target, make_rasterizer, native
-from splatam_core.rasterizer.base import MAX_ALPHA, MIN_ALPHA, NOT_COMPARED
+from splatam_core.rasterizer.base import FIT_TILE, MAX_ALPHA, MIN_ALPHA, NOT_COMPARED
 from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.rasterizer.reference import ReferenceRasterizer
 
@@ -186,6 +186,45 @@ def _assert_fits_like_the_reference(rasterizer: Rasterizer, scene: Scene, device
     assert (moments.steps == expected_moments.steps).float().mean() > 0.99 or not len(first)
     for one, other in zip(actual, expected, strict=True):
         assert one.shape == other.shape and torch.isfinite(one).all()
+
+
+def _by_triton(tile: int) -> Rasterizer:
+    from splatam_core.rasterizer.triton.rasterizer import TritonRasterizer
+
+    return TritonRasterizer(tile)
+
+
+@pytest.mark.parametrize('isa', ['generic', 'avx2', 'avx512', 'triton'])
+def test_squares_that_are_fitted_well_are_left_as_they_are(isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where half of a view is what the map shows, its squares of 8x8 pixels give no gradients: by every backend the same ones.
+
+    61x27 pixels: the last squares of a row and of a column are smaller.
+    """
+    monkeypatch.setenv('SPLATAM_ISA', 'generic' if isa == 'triton' else isa)
+    scene, device = scenes.random_scene(46, 150, 61, 27), scenes.device_of('triton') if isa == 'triton' else 'cpu'
+    rasterizer = _by_triton(FIT_TILE) if isa == 'triton' else CpuRasterizer(1)
+    if isa != 'triton' and rasterizer.instruction_set != isa:
+        pytest.skip(f'this processor runs {rasterizer.instruction_set}, not {isa}')
+    render = ReferenceRasterizer().render(scene.gaussians.detached(), scene.camera, scene.T_cam_world)
+    noise = 0.5 * torch.rand(3, 27, 61, generator=torch.Generator().manual_seed(2)) * (torch.arange(61) >= 24)
+    rgb8 = (255 * (render.rgb + noise)).clamp(0, 255).round().byte().permute(1, 2, 0).contiguous()
+    fitted = []
+    for backend, at, enough in (
+        (rasterizer, device, 0.01),
+        (ReferenceRasterizer(), 'cpu', 0.01),
+        (ReferenceRasterizer(), 'cpu', 0.0),
+    ):
+        g, n = scenes.on_device(scene.gaussians, at), len(scene.gaussians)
+        moments = Moments(torch.zeros(n, 16, device=at), torch.zeros(n, dtype=torch.uint8, device=at))
+        target = Target(
+            scene.camera, rgb8.to(at), render.depth_acc.float().to(at), scene.T_cam_world.float().to(at), 1.0, 1.0, enough
+        )
+        loss = float(backend.fit(g, moments, Rates(1e-4, 1e-3, 0.05, 2.5e-3), target))
+        fitted.append((loss, moments.steps.cpu(), moments.first_second[:, :8].cpu()))
+    (loss, steps, first), (expected_loss, expected_steps, expected_first), (_, all_steps, _) = fitted
+    assert loss == pytest.approx(expected_loss, rel=1e-5)
+    assert torch.equal(steps, expected_steps) and 0 < 1.3 * int(steps.sum()) < int(all_steps.sum())
+    assert torch.allclose(first, expected_first, atol=1e-4 * float(expected_first.abs().max()))
 
 
 @pytest.mark.parametrize(('backend', 'threads'), [('reference', 1), ('cpu', 2), ('triton', 0)])

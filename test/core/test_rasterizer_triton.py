@@ -272,7 +272,8 @@ POINTERS = {
 }
 INTEGERS = {'n', 'rows', 'capacity', 'width', 'height', 'tiles_x'}
 FLOATS = {
-    'fx', 'fy', 'cx', 'cy', 'color_weight', 'depth_weight', 'means_rate', 'log_scales_rate', 'logit_opacities_rate', 'rgb_rate',
+    'fx', 'fy', 'cx', 'cy', 'color_weight', 'depth_weight', 'enough', 'means_rate', 'log_scales_rate', 'logit_opacities_rate',
+    'rgb_rate',
 }
 CONSTANTS = {'TILE': 8, 'CHUNK': 4, 'BLOCK': 256, 'HAS_BOUNDS': True}
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -21,8 +23,10 @@ from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.rasterizer.native import make_native_aligner
 from splatam_core.slam import Slam
 from splatam_core.tracking import TorchAligner, alignment, make_tracker
-from splatam_core.tracking.aligner import EvidenceSums, Linearization
+from splatam_core.tracking.aligner import AlignmentState, Descent, EvidenceSums, Linearization
+from splatam_core.tracking.descent import descend
 from splatam_core.tracking.evidence import step_of
+from splatam_core.tracking.motion import Pace
 from splatam_core.tracking.torch_aligner import TorchLinearSystem
 from splatam_core.tracking.verdict import verify
 
@@ -70,6 +74,11 @@ def _tensors(*images: Image) -> list[torch.Tensor]:
 
 def _on_device(at: Linearization[Any]) -> Linearization[Any]:
     return at.converted(torch.from_numpy)
+
+
+def _task_on_device(task: Descent[Any]) -> Descent[Any]:
+    brightness, depth, layers = _tensors(task.brightness, task.depth, np.ascontiguousarray(task.layers[..., :6]))
+    return replace(task, brightness=brightness, depth=depth, layers=layers)
 
 
 @pytest.mark.parametrize('size', [(48, 65), (37, 40), (2, 2), (1, 5)])
@@ -199,6 +208,56 @@ def test_evidence_is_the_native_one(size: tuple[int, int], time_offset: float, r
         assert np.array_equal(ours, getattr(again, name)), name
 
 
+def _descent(size: tuple[int, int], is_free: Sequence[int] = range(10), **changed: Any) -> Descent[Any]:
+    """A frame that was taken near its reference, with another exposure."""
+    rng, (brightness, depth) = np.random.default_rng(7), _picture(1, size)
+    layers = make_native_aligner(1).layers(1.1 * brightness + 0.02, depth + np.float32(0.001) * rng.random(size, np.float32), EDGE)
+    known = {
+        'brightness': brightness, 'depth': depth, 'predicted_motion': se3.exp(0.5 * TWIST), 'pace': Pace(expected=0.4 * TWIST),
+        'mean': np.array([0.0] * 6 + [1, 0, 0.2, 0.1]), 'information': np.array([10.0] * 6 + [100, 100, 20, 30]),
+        'scale_factors': np.array([1.0, 1.5]), 'iterations': 5, 'small_step': 1e-4, 'is_free': np.isin(np.arange(10), is_free),
+        'max_depth_ratio': 0.1,
+    }  # fmt: skip
+    return Descent(camera=_camera(size), layers=layers, **known | changed)
+
+
+def _numbers(state: AlignmentState) -> np.ndarray:
+    others = state.gain, state.bias, state.time_offset, state.readout
+    return np.concatenate([state.depth_motion.ravel(), others, state.velocity, state.scales])
+
+
+START = AlignmentState(se3.exp(0.2 * TWIST), gain=1.02, bias=0.01, time_offset=0.15, readout=0.05)
+DESCENTS = {
+    'all unknowns': {},
+    'no readout': {'is_free': range(9)},
+    'camera alone, nothing expected': {'is_free': range(6), 'predicted_motion': None},
+    'one step': {'iterations': 1},
+    'none': {'iterations': 0},
+    'a pace that is not possible': {'pace': Pace(2, 30 * TWIST, limit_m=1e-3, limit_rad=1e-3)},
+    'half a turn': {'predicted_motion': se3.exp(np.array([1.0, 2, 3, 3.1, 0, 0])), 'pace': Pace(9), 'iterations': 2},
+    'too few points': {'brightness': np.full((60, 80), np.nan, np.float32), 'depth': np.full((60, 80), np.nan, np.float32)},
+}
+
+
+@pytest.mark.parametrize('isa', ['generic', 'avx2', 'avx512'])
+@pytest.mark.parametrize('changed', DESCENTS.values(), ids=DESCENTS)
+def test_descent_is_the_native_one(changed: dict[str, Any], isa: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Native code takes the steps that numpy does, to the rounding of motions to float32 in between; as often with any threads."""
+    monkeypatch.setenv('SPLATAM_ISA', isa)
+    if (runs := CpuRasterizer(1).instruction_set) != isa:
+        pytest.skip(f'this processor runs {runs}, not {isa}')
+    task, native = _descent((60, 80), **changed), make_native_aligner(1)
+    expected = descend(partial(native.linearize, **INLIERS), task, START)
+    found, again = (aligner.descend(task, START) for aligner in (native, make_native_aligner(3)))
+    assert np.allclose(_numbers(found), _numbers(expected), rtol=1e-6, atol=1e-6)
+    assert np.array_equal(_numbers(found), _numbers(again))
+    if not changed.keys() - {'is_free', 'predicted_motion'}:  # what can be aligned is
+        assert np.abs(found.depth_motion - np.eye(4)).max() < 0.01
+        assert not task.is_free[6] or found.gain == pytest.approx(1.1, abs=0.05)
+        by_torch = TorchAligner().descend(_task_on_device(task), START)
+        assert np.allclose(_numbers(by_torch)[:20], _numbers(found)[:20], atol=2e-3)  # points on the border fall on either side
+
+
 def test_nothing_in_sight_gives_an_empty_system() -> None:
     """No points, or none that fall into the frame: zeros, and medians that are NaN."""
     brightness, depth = _picture(4, (40, 50))
@@ -260,6 +319,9 @@ class _Bridge:
 
     def evidence(self, at: Linearization[Any], **settings: Any) -> EvidenceSums:
         return self._aligner.evidence(_on_device(at), **settings)
+
+    def descend(self, task: Descent[Any], start: AlignmentState) -> AlignmentState:
+        return self._aligner.descend(_task_on_device(task), start)
 
     def linearize(self, at: Linearization[Any], **settings: Any) -> TorchLinearSystem:
         return self._aligner.linearize(_on_device(at), **settings)

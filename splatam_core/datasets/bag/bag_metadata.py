@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 
+from splatam_core.datasets.bag.names import NAME
 from splatam_core.datasets.bag.qos import OfferedQos, offered_qos, recorded_qos
 from splatam_core.errors import DatasetError
 from splatam_core.text_files import parse_yaml, read_text
 
-NAME = 'metadata.yaml'
 MAX_BYTES = 2**24  # hundreds of splits and topics take a megabyte
 
 

@@ -16,7 +16,6 @@ from rosbags.typesys.store import Typestore
 from splatam_core.datasets.bag.cut_ros1 import CutRosbag1
 from splatam_core.datasets.bag.qos import OfferedQos, offered_qos
 
-ROS1_SUFFIX = '.bag'
 HEADER = 'std_msgs/msg/Header'
 
 

@@ -14,12 +14,11 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from splatam_core.datasets.bag.bag_metadata import BagMetadata, read_metadata
 from splatam_core.datasets.bag.cut_mcap import CutMcap
 from splatam_core.datasets.bag.cut_sqlite import CutSqlite
+from splatam_core.datasets.bag.names import SUFFIX, storage_files
 from splatam_core.datasets.bag.qos import OfferedQos, offered_qos
-from splatam_core.datasets.bag.unpacked import SUFFIX, UnpackedFile, journal_of, merged_with_journal, unpacked, unpacked_message
+from splatam_core.datasets.bag.unpacked import UnpackedFile, journal_of, merged_with_journal, unpacked, unpacked_message
 from splatam_core.errors import DatasetError, one_line
 
-ROSBAG2_SUFFIXES = ('.db3', '.mcap')
-FILE_ENDINGS = (*ROSBAG2_SUFFIXES, *(f'{suffix}{SUFFIX}' for suffix in ROSBAG2_SUFFIXES))
 Message = tuple[Connection, int, bytes]
 TopicKey = tuple[str, str]
 """Name and type of a topic. Files of one bag may disagree about everything else."""
@@ -175,11 +174,6 @@ class Rosbag2:
         else:
             return path
         return self._keep[-1].path
-
-
-def storage_files(folder: Path) -> list[str]:
-    """Returns the names of the files in a folder that hold messages, sorted."""
-    return sorted(file.name for file in folder.iterdir() if file.name.endswith(FILE_ENDINGS) and file.is_file())
 
 
 def _opened(path: Path, is_damaged: bool) -> BagFile:

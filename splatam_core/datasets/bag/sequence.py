@@ -44,10 +44,9 @@ from msg_adapters.errors import MessageError
 from splatam_core.datasets.bag import realsense
 from splatam_core.datasets.bag.index import BagIndex, read_index
 from splatam_core.datasets.bag.recording import Recording
-from splatam_core.datasets.bag.storage import is_bag
 from splatam_core.datasets.bag.topics import ChosenTopics, choose_topics, namespace
 from splatam_core.datasets.bag.typestore import CAMERA_INFO
-from splatam_core.datasets.base import Format, ReadOptions
+from splatam_core.datasets.base import ReadOptions
 from splatam_core.datasets.camera_file import CameraFile, find_camera_file
 from splatam_core.errors import CameraError, DatasetError, FrameError
 from splatam_core.geometry.camera import CameraCalibration
@@ -225,17 +224,3 @@ def _first_camera(recording: Recording, name: str) -> CameraCalibration | None:
                 except (MessageError, CameraError, DatasetError):
                     return None
     return None
-
-
-def _recognises(source: str) -> bool:
-    return is_bag(Path(source))
-
-
-def _open(source: str, options: ReadOptions) -> BagSequence:
-    return BagSequence(Path(source), options)
-
-
-FORMAT = Format(
-    'rosbag', 'a rosbag2 folder with metadata.yaml, a .db3 or .mcap file, or a ROS 1 .bag file', _recognises, _open,
-    has_topics=True, pairs_by_stamp=True,
-)  # fmt: skip

@@ -9,10 +9,10 @@ from typing import Protocol
 
 from rosbags.interfaces import Connection
 
-from splatam_core.datasets.bag.bag_metadata import NAME
+from splatam_core.datasets.bag.names import ROS1_SUFFIX
 from splatam_core.datasets.bag.qos import OfferedQos
-from splatam_core.datasets.bag.ros1 import ROS1_SUFFIX, Rosbag1
-from splatam_core.datasets.bag.rosbag2 import FILE_ENDINGS, Rosbag2, storage_files
+from splatam_core.datasets.bag.ros1 import Rosbag1
+from splatam_core.datasets.bag.rosbag2 import Rosbag2
 from splatam_core.errors import DatasetError, SplatamError
 
 
@@ -71,13 +71,6 @@ def open_storage(path: Path, *, is_damaged: bool = False) -> Storage:
         raise DatasetError(f'{path}: there is no such file or folder')
     with read_errors(path):
         return Rosbag1(path, is_damaged=is_damaged) if path.suffix == ROS1_SUFFIX else Rosbag2(path, is_damaged=is_damaged)
-
-
-def is_bag(path: Path) -> bool:
-    """Returns True if a path has the name of a bag or a folder has the files of one; nothing is opened."""
-    if path.is_dir():
-        return (path / NAME).is_file() or bool(storage_files(path))
-    return path.name.endswith((*FILE_ENDINGS, ROS1_SUFFIX)) and path.is_file()
 
 
 @contextmanager

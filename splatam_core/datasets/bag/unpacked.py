@@ -15,7 +15,6 @@ from backports import zstd
 
 from splatam_core.errors import DatasetError
 
-SUFFIX = '.zstd'
 MAGIC = b'\x28\xb5\x2f\xfd'
 MAX_MESSAGE = 2**30
 BLOCK = 2**24

@@ -110,7 +110,11 @@ def unusable(gaussian_map: GaussianMap) -> Tensor | None:
     gaussians = gaussian_map.gaussians.detached()
     parts = [gaussians.means, gaussians.log_scales, gaussians.logit_opacities, gaussians.rgb]
     parts += [] if gaussians.rotations is None else [gaussians.rotations]
-    if math.isfinite(float(torch.stack([values.sum() for values in parts]).sum())):
+    if is_on_host(gaussians.means):
+        total = sum(float(values.numpy().sum()) for values in parts)  # as in `prunable`
+    else:
+        total = float(torch.stack([values.sum() for values in parts]).sum())
+    if math.isfinite(total):
         return None
     broken = ~gaussians.usable()
     return broken if broken.any() else None

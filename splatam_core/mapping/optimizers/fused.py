@@ -13,6 +13,7 @@ from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.optimizers.base import TimeLimit, prune, rates
 from splatam_core.mapping.posed import PosedView
 from splatam_core.rasterizer import Rasterizer, Rates, Target
+from splatam_core.rasterizer.base import COLOR_LIMIT
 
 FINAL_FIRST, FINAL_LAST = 5.0, 0.1
 """Step sizes at the beginning and at the end of ``finish``, relative to those of ``fit``; half a cosine lies between them."""
@@ -53,7 +54,16 @@ class FusedOptimizer:
 
     def _step(self, gaussian_map: GaussianMap, posed: PosedView, rates: Rates) -> None:
         view, config = posed.view, self._config
-        target = Target(view.camera, view.rgb8, view.depth, posed.T_cam_world, config.color_weight, config.depth_weight)
+        enough = config.color_weight * config.fused.tolerance**2 / (2 * COLOR_LIMIT)  # the Huber loss of an error of colour alone
+        target = Target(
+            camera=view.camera,
+            rgb8=view.rgb8,
+            depth=view.depth,
+            T_cam_world=posed.T_cam_world,
+            color_weight=config.color_weight,
+            depth_weight=config.depth_weight,
+            enough=enough,
+        )
         self._rasterizer.fit(gaussian_map.gaussians, gaussian_map.moments, rates, target)
 
 

@@ -513,9 +513,12 @@ def _difference(drawn, wanted, weight, limit, counted):
 @triton.jit(do_not_specialize=['n', 'capacity'])
 def fit_tile(
     splats, order, entries, slots, begins, total, rgb8, depth, readings, gradients, losses,
-    n, capacity, width, height, tiles_x, color_weight, depth_weight, TILE: tl.constexpr, CHUNK: tl.constexpr,
+    n, capacity, width, height, tiles_x, color_weight, depth_weight, enough, TILE: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
-    """Blends a tile, compares it with rgb8 [H, W, 3] and depth [H, W], and writes gradients of the entries and losses [tiles]."""
+    """Blends a tile, compares it with rgb8 [H, W, 3] and depth [H, W], and writes gradients of the entries and losses [tiles].
+
+    The gradients are zero where the loss per pixel is less than ``enough``.
+    """
     column, row, on_image = _pixels(tiles_x, width, height, TILE)
     x, y, at = column.to(tl.float32), row.to(tl.float32), row * width + column
     begin, end, fits = _span(begins, total, tl.program_id(0), n, capacity)
@@ -530,7 +533,10 @@ def fit_tile(
     loss_g, gg = _difference(g, green, color_weight, COLOR_LIMIT, compared)
     loss_b, gb = _difference(b, blue, color_weight, COLOR_LIMIT, compared)
     loss_d, gd = _difference(d, range_m, weight, DEPTH_LIMIT_M, compared & (range_m > 0.0))
-    tl.store(losses + tl.program_id(0), tl.sum(loss_r + loss_g + loss_b + loss_d, axis=0))
+    loss = tl.sum(loss_r + loss_g + loss_b + loss_d, axis=0)
+    tl.store(losses + tl.program_id(0), loss)
+    is_fitted = tl.where(loss < enough * tl.sum(on_image.to(tl.float32), axis=0), 0.0, 1.0)
+    gr, gg, gb, gd = gr * is_fitted, gg * is_fitted, gb * is_fitted, gd * is_fitted
     _to_entries(
         splats, order, entries, slots, gradients, begin, end, fits, x, y, on_image,
         gr * r + gg * g + gb * b + gd * d, gr, gg, gb, gd, tl.zeros_like(gd), CHUNK,

@@ -228,7 +228,7 @@ def _fit_tiles(view: View, target: Target, gradients: Tensor) -> Tensor:
         splats=view.splats, order=view.order, entries=view.entries, slots=view.slots, begins=view.begins, total=view.total,
         rgb8=target.rgb8, depth=target.depth, readings=torch.count_nonzero(target.depth > 0), gradients=gradients, losses=losses,
         n=len(view.splats), color_weight=target.color_weight / (3 * camera.width * camera.height),
-        depth_weight=target.depth_weight, **_tiling(view),
+        depth_weight=target.depth_weight, enough=target.enough / (camera.width * camera.height), **_tiling(view),
     )  # fmt: skip
     return losses
 

@@ -176,6 +176,7 @@ def fit(values: Values, tally: Tally) -> None:
         'T_cam_world': values.pose(), 'camera': values.camera(), 'target_depth': values.image(high=4.0),
         'target_rgb': values.rng.integers(0, 256, (height, width, 3)).astype(np.uint8), 'color_weight': values.scalar(1.0),
         'depth_weight': values.scalar(1.0), 'color_limit': values.scalar(0.1), 'depth_limit': values.scalar(0.1),
+        'enough': values.scalar(0.01),
     }  # fmt: skip
     loss = tally.attempt(partial(_native.Engine(values.call.threads).fit, **values.spoilt(arguments)), *REFUSED)
     if is_sound(values):
