@@ -360,7 +360,8 @@ class FusedMappingConfig:
     tolerance: float = setting(
         0.0,
         'Parts of a view, 8x8 pixels each, are not fitted further where the map is off by less than this colour error (root mean '
-        'square, colours from 0 to 1; an error of depth counts as the loss weighs it). 0 = all are. Increase to save time.',
+        'square, colours from 0 to 1; an error of depth counts as the loss weighs it), except after the last frame. 0 = all are. '
+        'Increase to save time.',
         minimum=0.0, maximum=1.0,
     )  # fmt: skip
 

@@ -17,7 +17,7 @@ from splatam_core.mapping.densification import densify, new_gaussians, unexplain
 from splatam_core.mapping.gaussian_map import PARAMETERS, GaussianMap
 from splatam_core.mapping.keyframes import KeyframeStore, draw, overlaps, select_keyframes, views_to_fit
 from splatam_core.mapping.loss import mapping_loss
-from splatam_core.mapping.optimizers import TimeLimit, fused, make_optimizer, prunable
+from splatam_core.mapping.optimizers import FusedOptimizer, TimeLimit, fused, make_optimizer, prunable
 from splatam_core.mapping.optimizers.fused import FINAL_COLORS, FINAL_FIRST, FINAL_LAST, FINAL_MEANS
 from splatam_core.mapping.posed import PosedView
 from splatam_core.mapping.schedule import MappingSchedule
@@ -204,6 +204,15 @@ class _Listed(CpuRasterizer):
 def _finishing(passes: int, **more: object) -> MappingConfig:
     values = {'optimizer': 'fused', 'fused.final_passes': passes} | more
     return load_config(overrides={f'mapping.{name}': value for name, value in values.items()}).mapping
+
+
+def test_what_fits_is_left_alone_on_the_way_but_not_at_the_end() -> None:
+    """The tolerance is an error of colour: ``enough`` is its Huber loss, weighted as colour is."""
+    rasterizer, view = _Listed(), PosedView(_view(), EYE)
+    optimizer = FusedOptimizer(rasterizer, _finishing(1, color_weight=2.0, **{'fused.tolerance': 0.02}))
+    optimizer.fit(gaussian_map := _map(_view()), [view], 1.0)
+    optimizer.finish(gaussian_map, [view], np.random.default_rng(0), NO_LIMIT)
+    assert [target.enough for _, target in rasterizer.asked] == [pytest.approx(2 * 0.02**2 / 0.2), 0.0]
 
 
 def _finish(

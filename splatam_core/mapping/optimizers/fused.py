@@ -35,7 +35,7 @@ class FusedOptimizer:
     def fit(self, gaussian_map: GaussianMap, views: Iterable[PosedView], scene_radius: float) -> None:
         """See ``MapOptimizer.fit``."""
         for posed in views:
-            self._step(gaussian_map, posed, rates(self._config))
+            self._step(gaussian_map, posed, rates(self._config), self._config.fused.tolerance)
         prune(gaussian_map, self._config, scene_radius, self._config.fused.prune_fraction)
 
     def finish(self, gaussian_map: GaussianMap, keyframes: Sequence[PosedView], rng: np.random.Generator, limit: TimeLimit) -> int:
@@ -49,12 +49,12 @@ class FusedOptimizer:
                 done = time_used
             if done >= 1 or limit.stop():
                 return step
-            self._step(gaussian_map, keyframes[int(order[step % len(keyframes)])], _final_rates(self._config, done))
+            self._step(gaussian_map, keyframes[int(order[step % len(keyframes)])], _final_rates(self._config, done), tolerance=0.0)
         return num_steps
 
-    def _step(self, gaussian_map: GaussianMap, posed: PosedView, rates: Rates) -> None:
+    def _step(self, gaussian_map: GaussianMap, posed: PosedView, rates: Rates, tolerance: float) -> None:
         view, config = posed.view, self._config
-        enough = config.color_weight * config.fused.tolerance**2 / (2 * COLOR_LIMIT)  # the Huber loss of an error of colour alone
+        enough = config.color_weight * tolerance**2 / (2 * COLOR_LIMIT)  # the Huber loss of an error of colour alone
         target = Target(
             camera=view.camera,
             rgb8=view.rgb8,
