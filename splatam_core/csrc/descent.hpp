@@ -19,7 +19,7 @@ struct AlignmentState {
   double scales[2];  // of the residuals: brightness, relative depth
 };
 
-// How the camera is expected to move from frame to frame; see Pace in tracking/motion.py.
+// How the camera is expected to move from frame to frame; see Pace in tracking/pace.py.
 struct Pace {
   double num_frames;
   Twist expected;

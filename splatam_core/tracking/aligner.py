@@ -13,7 +13,7 @@ from torch import Tensor
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.se3 import Matrix
-from splatam_core.tracking.motion import Pace
+from splatam_core.tracking.pace import Pace
 
 Array = NDArray[np.float32]
 ImageT = TypeVar('ImageT', Array, Tensor)

@@ -31,7 +31,8 @@ from splatam_core.tracking.aligner import Aligner
 from splatam_core.tracking.base import TrackingResult
 from splatam_core.tracking.features import pose_by_features
 from splatam_core.tracking.gauss_newton import GaussNewton
-from splatam_core.tracking.motion import Pace, SeenMotion
+from splatam_core.tracking.motion import SeenMotion
+from splatam_core.tracking.pace import Pace
 from splatam_core.tracking.pyramid import Level, frame_level, full_pyramid, half_pyramid, render_level
 from splatam_core.tracking.time_offset import TimeOffset
 from splatam_core.tracking.torch_aligner import TorchAligner

@@ -9,7 +9,8 @@ from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Gaussians
 from splatam_core.tracking.evidence import Evidence
-from splatam_core.tracking.motion import Pace, SeenMotion
+from splatam_core.tracking.motion import SeenMotion
+from splatam_core.tracking.pace import Pace
 from splatam_core.tracking.readout import ReadoutSeen
 from splatam_core.tracking.time_offset import TimeOffset
 

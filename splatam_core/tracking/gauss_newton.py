@@ -14,7 +14,7 @@ from splatam_core.geometry.se3 import Matrix
 from splatam_core.tracking.aligner import Aligner, AlignmentState, Descent, LinearSystem
 from splatam_core.tracking.descent import READOUT, TIME_OFFSET, Equations
 from splatam_core.tracking.evidence import Evidence, Knowns, max_depth_error, step_of, weigh
-from splatam_core.tracking.motion import Pace
+from splatam_core.tracking.pace import Pace
 from splatam_core.tracking.pyramid import EDGE, Level
 from splatam_core.tracking.readout import ReadoutSeen
 from splatam_core.tracking.time_offset import TimeOffset

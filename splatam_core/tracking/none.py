@@ -10,7 +10,8 @@ from splatam_core.images.view import View
 from splatam_core.interruption import Stop, never
 from splatam_core.rasterizer import Gaussians, Rasterizer
 from splatam_core.tracking.base import TrackingResult
-from splatam_core.tracking.motion import Pace, SeenMotion
+from splatam_core.tracking.motion import SeenMotion
+from splatam_core.tracking.pace import Pace
 from splatam_core.tracking.time_offset import TimeOffset
 
 

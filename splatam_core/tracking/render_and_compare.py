@@ -17,7 +17,8 @@ from splatam_core.rasterizer import Gaussians, Rasterizer
 from splatam_core.tracking.base import TrackingResult
 from splatam_core.tracking.candidate import Candidate
 from splatam_core.tracking.loss import TrackingLoss, tracking_loss
-from splatam_core.tracking.motion import Pace, SeenMotion
+from splatam_core.tracking.motion import SeenMotion
+from splatam_core.tracking.pace import Pace
 from splatam_core.tracking.time_offset import TimeOffset
 from splatam_core.tracking.verdict import compare
 

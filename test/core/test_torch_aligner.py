@@ -26,7 +26,7 @@ from splatam_core.tracking import TorchAligner, alignment, make_tracker
 from splatam_core.tracking.aligner import AlignmentState, Descent, EvidenceSums, Linearization
 from splatam_core.tracking.descent import descend
 from splatam_core.tracking.evidence import step_of
-from splatam_core.tracking.motion import Pace
+from splatam_core.tracking.pace import Pace
 from splatam_core.tracking.torch_aligner import TorchLinearSystem
 from splatam_core.tracking.verdict import verify
 
