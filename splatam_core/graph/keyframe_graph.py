@@ -67,6 +67,7 @@ _MARGIN = 0.03  # of the width
 _TASKS_PER_KEYFRAME = 5  # about what a keyframe needs
 _MOST_TASKS = 6  # that wait; beyond it, places near the camera are not compared
 _NODES_PER_FRAME, _MOST_STEPS = 150, 4  # of an optimisation: so many nodes are moved by a step, or less; at most so many steps
+_AGREES = 0.5  # of the least correction, by which a loop that says nothing new is off
 _MOST_LOOPS = 10  # of a keyframe that takes over those of another one: a place seen for hours has no more than one seen twice
 
 _NO_POSES = np.empty((0, 4, 4))
@@ -451,8 +452,11 @@ class KeyframeGraph:
         self._links += loops
         for loop in found:
             place, frame = self.nodes.frames[[loop.first, loop.second]].tolist()
-            agrees = self._off(loop) <= self._config.min_correction_m
-            self._schedule = self._schedule.agreed(frame, place, self._every) if agrees else self._schedule.disagreed()
+            off, least = self._off(loop), self._config.min_correction_m
+            if off > least:
+                self._schedule = self._schedule.disagreed()
+            elif off <= _AGREES * least:
+                self._schedule = self._schedule.agreed(frame, place, self._every)
         if any(self._off(loop) > self._config.min_correction_m for loop in loops):
             self._schedule = self._schedule.disputed(is_disputed=True)
 
