@@ -388,11 +388,10 @@ class KeyframeGraph:
 
     def _return(self, task: Task, by_frame: dict[int, PosedView]) -> None:
         """Adds a loop, if the way back agrees with the way there."""
-        last = max(task.first, task.second)
-        one, other = self._shot(task.first, by_frame, last), self._shot(task.second, by_frame, last)
-        if one is None or other is None or self._pairs is None:
+        shots = self._shots(task.first, task.second, by_frame)
+        if shots is None or self._pairs is None:
             return
-        if (np.array(self._pairs.way_back(one, other, task.T_second_first)) > _MAX_BACK).any():
+        if (np.array(self._pairs.way_back(*shots, task.T_second_first)) > _MAX_BACK).any():
             return
         loop = Link.measured(task.first, task.second, se3.inverse(task.T_second_first), Kind.LOOP, task.covariance)
         self._found.append(replace(loop, kind=Kind.FOUND))
@@ -400,11 +399,10 @@ class KeyframeGraph:
 
     def _aligned(self, first: int, second: int, by_frame: dict[int, PosedView], T_second_first: Matrix) -> PairResult | None:
         """Aligns the images of two nodes, starting at a motion [4, 4]; returns None if the result is not sure."""
-        one, other = self._shot(first, by_frame, max(first, second)), self._shot(second, by_frame, max(first, second))
-        if one is None or other is None or self._pairs is None:
+        shots = self._shots(first, second, by_frame)
+        if shots is None or self._pairs is None:
             return None
-        one = replace(one, view=one.view.through(other.view.camera))  # those of a map that was loaded may be of another camera
-        there = self._pairs.align(one, other, T_second_first)
+        there = self._pairs.align(*shots, T_second_first)
         return there if there.overlap >= _LEAST_OVERLAP and there.agreement >= _LEAST_AGREEMENT else None
 
     def _is_time_to_solve(self, frame: int) -> bool:
@@ -412,6 +410,13 @@ class KeyframeGraph:
         is_joined = not self._tasks or self._tasks[0].work is not Work.JOIN
         is_due = self._schedule.is_disputed and is_joined
         return (self._solving is not None or is_due) and (not self._tasks or frame % 2 == 1)
+
+    def _shots(self, first: int, second: int, by_frame: dict[int, PosedView]) -> tuple[Shot, Shot] | None:
+        """Returns the images of two nodes, as one camera would show them; None if one's are gone."""
+        one, other = (self._shot(node, by_frame, max(first, second)) for node in (first, second))
+        if one is None or other is None:
+            return None
+        return replace(one, view=one.view.through(other.view.camera)), other  # that of a map that was loaded may be another one
 
     def _shot(self, node: int, by_frame: dict[int, PosedView], as_known_at: int) -> Shot | None:
         """Returns the images of a node, taken with the readout known at another; None if they are gone."""
