@@ -39,6 +39,7 @@ PRESET_THEN: dict[str, dict[str, object]] = {
         'mapping.fused.final_passes': 12,
         'tracking.align.relocalisation.enabled': False,
         'graph.enabled': False,
+        'mapping.fused.tolerance': 0.0,
     }
 }
 
