@@ -16,8 +16,9 @@ from splatam_core.tracking.aligner import Aligner
 from splatam_core.tracking.evidence import Evidence
 from splatam_core.tracking.gauss_newton import GaussNewton
 from splatam_core.tracking.pyramid import Level, frame_level, half_pyramid
-from splatam_core.tracking.read_motion import STILL, ReadMotion, unrolled
+from splatam_core.tracking.read_motion import STILL, ReadMotion
 from splatam_core.tracking.time_offset import TimeOffset
+from splatam_core.tracking.unrolling import unrolled
 
 _KEPT_PYRAMIDS = 8
 _READOUT_STEP_S = 1e-3  # an estimate that changes by less is the same: a pyramid is not made anew at every frame

@@ -18,9 +18,10 @@ from splatam_core.images.view import View
 from splatam_core.tracking.alignment import make_aligner
 from splatam_core.tracking.motion import MotionModel
 from splatam_core.tracking.pyramid import Level
-from splatam_core.tracking.read_motion import STILL, ReadMotion, unrolled
+from splatam_core.tracking.read_motion import STILL, ReadMotion
 from splatam_core.tracking.readout import Readout
 from splatam_core.tracking.time_offset import TimeOffset
+from splatam_core.tracking.unrolling import unrolled
 
 THERE, BACK = 16, 28  # the head is shaken one way, and the other way; places 6 degrees apart
 FRAME_S = 1e-9 * FRAME_NS
