@@ -293,7 +293,7 @@ class SlamLifecycle:
             The number of steps taken.
         """
         self.optimize_graph()
-        return self._mapper.finish(TimeLimit(limit_s, stop))
+        return self._mapper.finish(TimeLimit(limit_s, stop), is_corrected=self.graph.num_corrections > 0)
 
     def optimize_graph(self) -> float:
         """Corrects poses and map so that they agree best with all that the graph has measured.

@@ -169,11 +169,17 @@ class Mapper:
         moved = np.array(T_cam_world).reshape(-1, 4, 4) @ se3.inverse(motion_of(frames))
         self.keyframes.place([torch.from_numpy(T.astype(np.float32)) for T in moved])
 
-    def finish(self, limit: TimeLimit) -> int:
-        """Fits the map to all keyframes once more, after the last frame. Returns the number of steps."""
+    def finish(self, limit: TimeLimit, *, is_corrected: bool) -> int:
+        """Fits the map to all keyframes once more, after the last frame. Returns the number of steps.
+
+        Args:
+            limit: says when to stop.
+            is_corrected: True if Gaussians were moved to other poses than those they were fitted at.
+        """
         if not self._config.mapping.enabled:
             return 0
-        return self._optimizer.finish(self.map, self.keyframes.window(self.keyframes), self.rng, limit)
+        window = self.keyframes.window(self.keyframes)
+        return self._optimizer.finish(self.map, window, self.rng, limit, is_corrected=is_corrected)
 
     def restore(self, arrays: Arrays, keyframes: Iterable[PosedView], rng: dict[str, Any], scene_radius: float) -> None:
         """Continues from the state of another mapper.

@@ -211,14 +211,26 @@ def test_what_fits_is_left_alone_on_the_way_but_not_at_the_end() -> None:
     rasterizer, view = _Listed(), PosedView(_view(), EYE)
     optimizer = FusedOptimizer(rasterizer, _finishing(1, color_weight=2.0, **{'fused.tolerance': 0.02}))
     optimizer.fit(gaussian_map := _map(_view()), [view], 1.0)
-    optimizer.finish(gaussian_map, [view], np.random.default_rng(0), NO_LIMIT)
+    optimizer.finish(gaussian_map, [view], np.random.default_rng(0), NO_LIMIT, is_corrected=False)
     assert [target.enough for _, target in rasterizer.asked] == [pytest.approx(2 * 0.02**2 / 0.2), 0.0]
 
 
 def _finish(
-    keyframes: list[PosedView], rasterizer: Rasterizer, config: MappingConfig, rng: np.random.Generator, limit: TimeLimit = NO_LIMIT
+    keyframes: list[PosedView],
+    rasterizer: Rasterizer,
+    config: MappingConfig,
+    rng: np.random.Generator,
+    limit: TimeLimit = NO_LIMIT,
+    *,
+    is_corrected: bool = False,
 ) -> int:
-    return make_optimizer(rasterizer, config).finish(_map(_view()), keyframes, rng, limit)
+    return make_optimizer(rasterizer, config).finish(_map(_view()), keyframes, rng, limit, is_corrected=is_corrected)
+
+
+def test_a_map_that_was_corrected_is_fitted_twice_as_often_at_the_end() -> None:
+    rasterizer = _Listed()
+    assert _finish([PosedView(_view(), EYE)], rasterizer, _finishing(3), np.random.default_rng(0), is_corrected=True) == 6
+    assert len(rasterizer.asked) == 6
 
 
 def test_finishing_fits_every_keyframe_as_often_with_fading_steps() -> None:

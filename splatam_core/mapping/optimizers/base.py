@@ -45,7 +45,10 @@ class MapOptimizer(Protocol):
         """
         ...
 
-    def finish(self, gaussian_map: GaussianMap, keyframes: Sequence[PosedView], rng: np.random.Generator, limit: TimeLimit) -> int:
+    def finish(
+        self, gaussian_map: GaussianMap, keyframes: Sequence[PosedView], rng: np.random.Generator, limit: TimeLimit, *,
+        is_corrected: bool,
+    ) -> int:  # fmt: skip
         """Fits the map to all keyframes once more, after the last frame.
 
         Args:
@@ -53,6 +56,7 @@ class MapOptimizer(Protocol):
             keyframes: the views to fit.
             rng: draws the order of each pass.
             limit: when to end.
+            is_corrected: True if Gaussians were moved to other poses than those they were fitted at.
 
         Returns:
             The number of steps taken.

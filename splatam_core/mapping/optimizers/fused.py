@@ -15,6 +15,9 @@ from splatam_core.mapping.posed import PosedView
 from splatam_core.rasterizer import Rasterizer, Rates, Target
 from splatam_core.rasterizer.base import COLOR_LIMIT
 
+CORRECTED_PASSES = 2
+"""Times as many final passes where loops have moved Gaussians: they were fitted at other poses."""
+
 FINAL_FIRST, FINAL_LAST = 5.0, 0.1
 """Step sizes at the beginning and at the end of ``finish``, relative to those of ``fit``; half a cosine lies between them."""
 
@@ -38,9 +41,13 @@ class FusedOptimizer:
             self._step(gaussian_map, posed, rates(self._config), self._config.fused.tolerance)
         prune(gaussian_map, self._config, scene_radius, self._config.fused.prune_fraction)
 
-    def finish(self, gaussian_map: GaussianMap, keyframes: Sequence[PosedView], rng: np.random.Generator, limit: TimeLimit) -> int:
+    def finish(
+        self, gaussian_map: GaussianMap, keyframes: Sequence[PosedView], rng: np.random.Generator, limit: TimeLimit, *,
+        is_corrected: bool,
+    ) -> int:  # fmt: skip
         """See ``MapOptimizer.finish``. Decreasing step sizes bring back what few steps a frame had forgotten."""
-        num_steps, began_s = self._config.fused.final_passes * len(keyframes), time.monotonic()
+        passes = self._config.fused.final_passes * (CORRECTED_PASSES if is_corrected else 1)
+        num_steps, began_s = passes * len(keyframes), time.monotonic()
         for step in range(num_steps):
             if step % len(keyframes) == 0:
                 order = rng.permutation(len(keyframes))

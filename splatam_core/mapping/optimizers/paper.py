@@ -32,7 +32,10 @@ class PaperOptimizer:
         gaussian_map.stop_optimization()
         drop_unusable(gaussian_map)
 
-    def finish(self, gaussian_map: GaussianMap, keyframes: Sequence[PosedView], rng: np.random.Generator, limit: TimeLimit) -> int:
+    def finish(
+        self, gaussian_map: GaussianMap, keyframes: Sequence[PosedView], rng: np.random.Generator, limit: TimeLimit, *,
+        is_corrected: bool,
+    ) -> int:  # fmt: skip
         """Leaves the map as it is, as in the paper; ``splatam refine`` optimizes a finished map."""
         return 0
 
