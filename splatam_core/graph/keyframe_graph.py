@@ -515,12 +515,14 @@ class KeyframeGraph:
     def _is_drift(self, nodes: Sequence[int], solution: Matrix) -> bool:
         """Returns whether the poses [N, 4, 4] of a solution explain most of what loops disagree with the present ones.
 
-        If they do not, loops err by as much as the poses: each of them says something else, and the poses follow its error.
+        If they do not, loops err by as much as the poses: each of them says something else, and the poses follow its error. What
+        loops of one keyframe say, some correction always explains: as with parameters of a fit, they do not count.
         """
         T_now, T_then = dict(zip(nodes, self.nodes.T_world_cam[nodes])), dict(zip(nodes, solution))
         loops = [loop for loop in self.loops() if loop.first in T_now and loop.second in T_now]
         now, then = (np.square(deviations(loops, T)).sum() for T in (T_now, T_then))
-        return bool(then <= (1 - _LEAST_DRIFT) * now)
+        keyframes = len({loop.second for loop in loops})
+        return bool(keyframes and then <= (1 - _LEAST_DRIFT) * (1 - 1 / keyframes) * now)
 
     def _off(self, loop: Link) -> float:
         """Returns by how much a loop would move its second node: m or rad, whichever is more."""
