@@ -153,6 +153,8 @@ def stage_times(ax: Axes, evaluation: Evaluation, theme: Theme) -> None:
         _note(ax, 'no times recorded', theme)
         return
     stage_colors = {'track': theme.estimate, 'densify': theme.green, 'keyframes': theme.orange, 'map': theme.violet}
+    if any(record.timings.graph for record in records):
+        stage_colors['graph'] = theme.pink
     stages = [stage for stage in STAGES if stage in stage_colors]
     times_ms = np.array([[getattr(record.timings, stage) for record in records] for stage in stages])
     medians = np.median(times_ms, axis=1)
