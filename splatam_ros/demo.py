@@ -14,8 +14,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType, TracebackType
 
@@ -59,12 +59,12 @@ class Processes:
     def start(self, *command: str, log: Path | None = None) -> subprocess.Popen[bytes]:
         """Start one of the package's commands. Its output goes to the log, or to the terminal if there is none."""
         print(f'$ {shlex.join(command)}' + (f' &> {log}' if log else ''), flush=True)
-        with log.open('wb') if log else nullcontext() as output:
+        with log.open('wb') if log else nullcontext() as output, signals_wait():
             process = subprocess.Popen(
                 [sys.executable, '-m', COMMANDS[command[0]], *command[1:]],
                 env=self._environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True,
             )  # fmt: skip
-        self._started.append(process)
+            self._started.append(process)
         return process
 
     def run(self, *command: str) -> None:
@@ -249,6 +249,20 @@ def next_steps(out: Path) -> str:
 def stop(number: int, frame: FrameType | None) -> None:
     """End the demo and its processes."""
     raise KeyboardInterrupt
+
+
+@contextmanager
+def signals_wait() -> Iterator[None]:
+    """Lets signals that end the demo wait for the end of a block: a process must be known before they end it."""
+    came: list[int] = []
+    handlers = {number: signal.signal(number, lambda number, _: came.append(number)) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    if came:
+        raise KeyboardInterrupt
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -16,7 +16,7 @@ import pytest
 from domains import reserve_domain
 
 from splatam_core.maps.viewer.browser import find_browser
-from splatam_ros.demo import require_replaceable
+from splatam_ros.demo import Processes, require_replaceable, stop
 
 DEMO = [sys.executable, '-m', 'splatam_ros.demo']
 TAG = 'SPLATAM_TEST_DEMO'
@@ -118,6 +118,26 @@ def test_a_node_that_dies_ends_the_demo_with_its_last_words(out: Path) -> None:
     assert 'was killed by SIGKILL' in said
     assert 'node.log' in said
     wait_until(lambda: not alive(out))  # the viewer notices by itself that the node is gone
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_a_process_starts_ends_it(number: signal.Signals, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The child lives already, but ``Popen`` has not returned."""
+    begun, start = [], subprocess.Popen
+
+    def started(*args: object, **options: object) -> subprocess.Popen[bytes]:
+        begun.append(start([sys.executable, '-c', 'import time; time.sleep(60)'], stdout=subprocess.DEVNULL))
+        os.kill(os.getpid(), number)
+        return begun[0]
+
+    before = signal.signal(signal.SIGTERM, stop)
+    monkeypatch.setattr(subprocess, 'Popen', started)
+    try:
+        with pytest.raises(KeyboardInterrupt), Processes() as processes:
+            processes.start('splatam', log=tmp_path / 'log')
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert begun[0].poll() is not None
 
 
 @pytest.mark.parametrize(('number', 'step'), [(signal.SIGINT, 'convert'), (signal.SIGTERM, 'splatam_ros.player.main')])
