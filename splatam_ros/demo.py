@@ -20,6 +20,7 @@ from pathlib import Path
 from types import FrameType, TracebackType
 
 from splatam_core.errors import ViewerError
+from splatam_core.interruption import on_stop_signals
 from splatam_core.maps.viewer.browser import find_browser
 from splatam_core.maps.viewer.scene import check_viser
 from splatam_core.runs.layout import VIEWER_PICTURE
@@ -255,12 +256,8 @@ def stop(number: int, frame: FrameType | None) -> None:
 def signals_wait() -> Iterator[None]:
     """Lets signals that end the demo wait for the end of a block: a process must be known before they end it."""
     came: list[int] = []
-    handlers = {number: signal.signal(number, lambda number, _: came.append(number)) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with on_stop_signals(lambda number, _: came.append(number)):
         yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
     if came:
         raise KeyboardInterrupt
 
@@ -271,10 +268,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('source', nargs='?', metavar='SOURCE', help='a rosbag2 or a dataset (default: a synthetic room)')
     parser.add_argument('--out', type=Path, default=Path('out/demo'), help='folder of the run (default: %(default)s)')
     args = parser.parse_args(arguments)
-    for number in (signal.SIGINT, signal.SIGTERM):  # background jobs of a shell ignore SIGINT otherwise
-        signal.signal(number, stop)
     try:
-        demo(args.source, args.out)
+        with on_stop_signals(stop):  # background jobs of a shell ignore SIGINT otherwise
+            demo(args.source, args.out)
         print(f'look at {args.out}/report.html; beside it are report.png, map.ply, trajectory.txt and metrics.json')
         print(next_steps(args.out))
     except DemoError as error:

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from domains import reserve_domain
 
+from splatam_core.interruption import STOP_SIGNALS, on_stop_signals
 from splatam_core.maps.viewer.browser import find_browser
 from splatam_ros.demo import Processes, require_replaceable, stop
 
@@ -120,7 +121,7 @@ def test_a_node_that_dies_ends_the_demo_with_its_last_words(out: Path) -> None:
     wait_until(lambda: not alive(out))  # the viewer notices by itself that the node is gone
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', STOP_SIGNALS)
 def test_a_signal_while_a_process_starts_ends_it(number: signal.Signals, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The child lives already, but ``Popen`` has not returned."""
     begun, start = [], subprocess.Popen
@@ -130,17 +131,13 @@ def test_a_signal_while_a_process_starts_ends_it(number: signal.Signals, monkeyp
         os.kill(os.getpid(), number)
         return begun[0]
 
-    before = signal.signal(signal.SIGTERM, stop)
     monkeypatch.setattr(subprocess, 'Popen', started)
-    try:
-        with pytest.raises(KeyboardInterrupt), Processes() as processes:
-            processes.start('splatam', log=tmp_path / 'log')
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    with on_stop_signals(stop), pytest.raises(KeyboardInterrupt), Processes() as processes:
+        processes.start('splatam', log=tmp_path / 'log')
     assert begun[0].poll() is not None
 
 
-@pytest.mark.parametrize(('number', 'step'), [(signal.SIGINT, 'convert'), (signal.SIGTERM, 'splatam_ros.player.main')])
+@pytest.mark.parametrize(('number', 'step'), [(signal.SIGINT, 'convert'), (signal.SIGHUP, 'splatam_ros.player.main')])
 def test_a_signal_ends_every_process(out: Path, number: signal.Signals, step: str) -> None:
     process = start_demo(out, 'synthetic:frames=12')
     wait_until(lambda: any(step in command for command in alive(out)))
