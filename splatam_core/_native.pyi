@@ -10,11 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatam_core.geometry.camera import PinholeCamera
-from splatam_core.tracking.aligner import AlignmentState, Descent, Linearization
+from splatam_core.tracking.aligner import AlignmentState, Descent, Knowns, Linearization
+from splatam_core.tracking.aligner import EvidenceSums as GivenSums
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 Doubles = NDArray[np.float64]
+
+class UndeterminedError(np.linalg.LinAlgError):
+    """A system of equations without a solution."""
 
 BLOCK: int
 """Gaussians per row of ``Gaussians.bounds``."""
@@ -136,6 +140,18 @@ class EvidenceSums:
     @property
     def cells(self) -> NDArray[np.float64]: ...
 
+class PoseWeight:
+    """See ``tracking.aligner.PoseWeight``."""
+
+    @property
+    def covariance(self) -> NDArray[np.float64]: ...
+    @property
+    def num_open(self) -> int: ...
+    @property
+    def explained(self) -> float: ...
+    @property
+    def num_explained(self) -> int: ...
+
 class Aligner:
     """See ``tracking.aligner.Aligner``. Layers have two more channels of padding."""
 
@@ -149,6 +165,7 @@ class Aligner:
     def linearize(self, at: Linearization[Floats], *, inlier_color: float, inlier_depth: float) -> LinearSystem: ...
     def descend(self, task: Descent[Floats], start: AlignmentState) -> AlignmentState: ...
     def evidence(self, at: Linearization[Floats], *, max_depth_error: float, step: int) -> EvidenceSums: ...
+    def weigh(self, sums: GivenSums, known: Knowns) -> PoseWeight: ...
 
 def solve_blocks(place: NDArray[np.int32], blocks: Doubles, right_hand_side: Doubles) -> None:
     """Solves a sparse symmetric system of 6x6 blocks; the solution [N, 6] replaces the right-hand side.

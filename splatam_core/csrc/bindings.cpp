@@ -12,6 +12,7 @@
 #include "block_cholesky.hpp"
 #include "descent.hpp"
 #include "engine.hpp"
+#include "weigh.hpp"
 
 namespace py = pybind11;
 using Array = py::array_t<float, py::array::c_style>;
@@ -338,6 +339,43 @@ EvidenceOfView evidence(Aligner& aligner, const py::object& at, float max_depth_
   return {matrix(found.claimed), matrix(found.shared), matrix(found.scores), matrix(found.cells)};
 }
 
+// EvidenceSums of either aligner, copied.
+Aligner::Evidence sums_of(const Given& given) {
+  Aligner::Evidence sums;
+  const auto copy = [&](const char* name, auto& to) {
+    constexpr py::ssize_t kColumns = std::extent_v<std::remove_reference_t<decltype(to)>, 1>;
+    const py::object array = given.member(name);
+    std::copy_n(values<double>(array, name, {kUnknowns, kColumns}), kUnknowns * kColumns, &to[0][0]);
+  };
+  copy("claimed", sums.claimed), copy("shared", sums.shared), copy("scores", sums.scores), copy("cells", sums.cells);
+  return sums;
+}
+
+// PoseWeight as Python sees it.
+struct WeightOfPose {
+  py::array_t<double> covariance;
+  int num_open;
+  double explained;
+  int num_explained;
+};
+
+WeightOfPose weigh_sums(Aligner&, const py::object& given_sums, const py::object& given_known) {
+  const Aligner::Evidence sums = sums_of(Given{given_sums, "sums", "EvidenceSums"});
+  const Given given{given_known, "known", "Knowns"}, camera{given.member("camera"), "camera", "a PinholeCamera"};
+  Knowns known{camera.number<int>("width"), camera.number<int>("height"), given.number<int>("step")};
+  check_size(known.width, known.height);
+  if (known.step < 1) throw py::value_error("step is " + std::to_string(known.step) + "; expected at least 1");
+  given.copy("velocity", known.velocity, 6), given.copy("prior", known.prior, kUnknowns);
+  given.copy("is_free", known.is_free, kUnknowns);
+  known.prior_inflation = given.number<double>("prior_inflation");
+  PoseWeight weight;
+  {
+    py::gil_scoped_release release;
+    weight = weigh(sums, known);
+  }
+  return {matrix(weight.covariance), weight.num_open, weight.explained, weight.num_explained};
+}
+
 py::tuple halve(Aligner& aligner, const py::object& brightness, const py::object& depth, float max_step) {
   const GivenLevel level = level_of(brightness, depth);
   const int width = int(level.size.width), height = int(level.size.height);
@@ -448,12 +486,18 @@ void bind_aligner(py::module_& module) {
       .def_readonly("shared", &EvidenceOfView::shared)
       .def_readonly("scores", &EvidenceOfView::scores)
       .def_readonly("cells", &EvidenceOfView::cells);
+  py::class_<WeightOfPose>(module, "PoseWeight")
+      .def_readonly("covariance", &WeightOfPose::covariance)
+      .def_readonly("num_open", &WeightOfPose::num_open)
+      .def_readonly("explained", &WeightOfPose::explained)
+      .def_readonly("num_explained", &WeightOfPose::num_explained);
   py::class_<Aligner>(module, "Aligner")
       .def(py::init([](int threads) { return std::make_unique<Aligner>(checked_threads(threads)); }),
            py::arg("threads"))
       .def("linearize", &linearize, py::arg("at"), py::kw_only(), py::arg("inlier_color"), py::arg("inlier_depth"))
       .def("descend", &descend_from, py::arg("task"), py::arg("start"))
       .def("evidence", &evidence, py::arg("at"), py::kw_only(), py::arg("max_depth_error"), py::arg("step"))
+      .def("weigh", &weigh_sums, py::arg("sums"), py::arg("known"))
       .def("halve", &halve, py::arg("brightness"), py::arg("depth"), py::arg("max_step"))
       .def("frame_images", &frame_images, py::arg("rgb8"), py::arg("depth"), py::arg("max_gap"), py::arg("max_step"))
       .def("render_images", &render_images, py::arg("rgb"), py::arg("depth_acc"), py::arg("silhouette"),
@@ -469,6 +513,8 @@ PYBIND11_MODULE(_native, module) {
   module.doc() = "The CPU rasterizer's and the alignment's kernels.";
   module.attr("BLOCK") = kBlock;
   py::register_exception<TooLarge>(module, "TooLargeError", PyExc_ValueError);
+  const py::object no_solution = py::module_::import("numpy.linalg").attr("LinAlgError");
+  py::register_exception<Undetermined>(module, "UndeterminedError", no_solution);
   bind_engine(module);
   bind_aligner(module);
   bind_blender(module);

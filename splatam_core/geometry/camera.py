@@ -6,6 +6,7 @@ A pixel's centre is its integer index, everywhere. Resizing by ``s`` therefore m
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -49,7 +50,7 @@ class PinholeCamera:
             raise CameraError(f'camera size {self.width}x{self.height}: both must be at least 1 pixel')
         if self.width > MAX_SIDE or self.height > MAX_SIDE:
             raise CameraError(f'camera size {self.width}x{self.height}: both must be at most {MAX_SIDE} pixels')
-        if not (np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() and self.fx > 0 and self.fy > 0):
+        if not (all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy))) and self.fx > 0 and self.fy > 0):
             raise CameraError(
                 f'camera intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}: focal lengths must be '
                 'positive and all four finite; is the camera calibrated?'

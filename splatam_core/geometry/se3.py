@@ -14,6 +14,10 @@ Vector = NDArray[np.float64]
 
 def inverse(T: Matrix) -> Matrix:
     """Returns the inverse motion [..., 4, 4]; its rotation is as orthonormal as that of T."""
+    if T.ndim == 2:  # single numbers: see ``exp``
+        (a, b, c, x), (d, e, f, y), (g, h, i, z), _ = T.tolist()
+        rows = [a, d, g, -(a * x + d * y + g * z)], [b, e, h, -(b * x + e * y + h * z)], [c, f, i, -(c * x + f * y + i * z)]
+        return np.array([*rows, [0.0, 0.0, 0.0, 1.0]])
     R_t = np.swapaxes(T[..., :3, :3], -1, -2)
     result = np.zeros_like(T)
     result[..., :3, :3] = R_t

@@ -15,7 +15,7 @@ _SSIM_WINDOW = cv2.getGaussianKernel(11, 1.5)  # [11, 1]
 
 def is_on_host(tensor: Tensor) -> bool:
     """Returns whether numpy and OpenCV can read the tensor."""
-    return tensor.device.type == 'cpu'
+    return tensor.is_cpu
 
 
 def blurred(images: Tensor) -> Tensor:

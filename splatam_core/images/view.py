@@ -57,6 +57,10 @@ class View:
         rgb8, depth = self.rgb8.to(device, non_blocking=True), self.depth.to(device, non_blocking=True)
         return View(self.camera, rgb8, depth, self.spacing)
 
+    def bare(self) -> View:
+        """Returns the view without cached images."""
+        return View(self.camera, self.rgb8, self.depth, self.spacing)
+
     @cached_property
     def rgb(self) -> Tensor:
         """[3, H, W] in [0, 1]."""
@@ -121,7 +125,8 @@ def unproject(camera: PinholeCamera, u: Tensor, v: Tensor, z: Tensor) -> Tensor:
 
 def usable_depth(depth_m: NDArray[np.float32], config: DepthConfig) -> NDArray[np.float32]:
     """Returns [H, W] the readings that are in the configured range and not at depth edges; 0 elsewhere."""
-    usable = (depth_m >= config.min_m) & (depth_m <= config.max_m)
+    usable = depth_m >= config.min_m
+    usable &= depth_m <= config.max_m
     if config.edge_filter > 0:
         usable &= ~_is_flying(depth_m, config.edge_filter)
     return kept(depth_m, usable)

@@ -15,7 +15,7 @@ from splatam_core.images.spacing import WINDOW
 from splatam_core.images.view import View, unproject
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.ghosts import ghosts, seen_through
-from splatam_core.mapping.posed import PosedView
+from splatam_core.mapping.posed import Before, PosedView
 from splatam_core.rasterizer import Gaussians, Rasterizer, Render
 from splatam_core.rasterizer.base import BLUR_PX2
 
@@ -45,7 +45,7 @@ def densify(
     T_cam_world: Tensor,
     rasterizer: Rasterizer,
     config: DensificationConfig,
-    before: Render | None = None,
+    before: Before | None = None,
 ) -> Tensor:
     """Removes the Gaussians that the view sees through, and adds those that make the map explain it.
 
@@ -55,27 +55,27 @@ def densify(
         T_cam_world: [4, 4] where it was taken from.
         rasterizer: renders the map.
         config: where Gaussians are added.
-        before: the map as it is, rendered from there at the size at which they are added, if that exists already.
+        before: the view and the map as it is, at the size at which they are added, if these exist already.
 
     Returns:
         [K, 3] where the Gaussians were that were removed.
     """
-    view = view.narrowed(config.scale, config.max_width)
+    view = view.narrowed(config.scale, config.max_width) if before is None else before.view
     gone = gaussian_map.means.new_zeros(0, 3)
 
     def render() -> Render:
         return rasterizer.render(gaussian_map.gaussians.detached(), view.camera, T_cam_world)
 
     with torch.no_grad():
-        before = before or render()
-        through = seen_through(before, view) if config.depth_noise_ratio > 0 else None  # the paper removes nothing
+        drawn = render() if before is None else before.render
+        through = seen_through(drawn, view) if config.depth_noise_ratio > 0 else None  # the paper removes nothing
         if through is not None:
             means = gaussian_map.means.detach()
             is_ghost = ghosts(means, PosedView(view, T_cam_world), through)
             gone = means[is_ghost]
             gaussian_map.keep(~is_ghost)
-            before = render()
-        chosen = without_speckles(unexplained(before, view, config), view)
+            drawn = render()
+        chosen = without_speckles(unexplained(drawn, view, config), view)
         depth, widths_px = view.depth, new_widths(view)
         added = gaussian_map.append(new_gaussians(view, chosen, depth, T_cam_world, config.opacity, widths_px))
         chosen = chosen.masked_scatter(chosen, added)  # without those that were refused
@@ -136,9 +136,10 @@ def without_speckles(chosen: Tensor, view: View) -> Tensor:
     v, u = torch.nonzero(chosen, as_tuple=True)
     reach = math.ceil(view.spacing) + 1
     depth, z = functional.pad(view.depth, (reach,) * 4), view.depth[v, u]
-    supporters = torch.full_like(v, -1)  # not itself
-    for down, right in itertools.product(range(2 * reach + 1), repeat=2):
-        supporters += (depth[v + down, u + right] - z).abs() <= SAME_SURFACE * z
+    supporters, most = torch.full_like(v, -1), SAME_SURFACE * z  # not itself
+    first, around = v * depth.shape[1] + u, range(2 * reach + 1)
+    for down, right in itertools.product(around, repeat=2):
+        supporters += (depth.take(first + (down * depth.shape[1] + right)) - z).abs() <= most
     alone = supporters < MIN_SUPPORTERS
     is_speckled = alone.sum() > MAX_ALONE * view.valid.sum()
     return chosen.masked_scatter(chosen, ~(alone & is_speckled))
@@ -193,5 +194,5 @@ def new_gaussians(
         means=(points - t) @ R,
         log_scales=torch.log(radii),
         logit_opacities=points.new_full((len(points),), math.log(opacity / (1 - opacity))),
-        rgb=view.rgb[:, v, u].T.contiguous(),
+        rgb=view.rgb8[v, u].float().div_(255),
     )

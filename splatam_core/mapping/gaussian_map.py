@@ -39,6 +39,7 @@ class GaussianMap:
         logit_opacities: [N].
         rgb: [N, 3], nominally in [0, 1].
         rotations: [N, 4] see ``Gaussians``; None when isotropic.
+        added_by: [N] number of the frame that added each Gaussian, its anchor; 0 for those of a map that was loaded.
         num_refused: number of Gaussians that were not added or were dropped because a value was not finite.
         frame: number of the frame that Gaussians are added by from now on.
     """
@@ -48,6 +49,7 @@ class GaussianMap:
     logit_opacities: Tensor
     rgb: Tensor
     rotations: Tensor | None
+    added_by: Tensor
 
     def __init__(self, anisotropic: bool = False, device: torch.device = HOST) -> None:
         self._size = self.num_refused = self.frame = 0
@@ -85,11 +87,6 @@ class GaussianMap:
     def moments(self) -> Moments:
         """Adam moments of the fused optimizer (``Rasterizer.fit``); they live as long as their Gaussians."""
         return Moments(self._storage['first_second'][: self._size], self._storage['steps'][: self._size])
-
-    @property
-    def added_by(self) -> Tensor:
-        """[N] number of the frame that added each Gaussian, its anchor; 0 for those of a map that was loaded."""
-        return self._storage[ADDED_BY][: self._size]
 
     def append(self, new: Gaussians) -> Tensor:
         """Adds Gaussians, but none that is not ``usable``. Ends an optimization in progress. They keep their anchors.
@@ -289,8 +286,8 @@ class GaussianMap:
         return new
 
     def _refresh_views(self) -> None:
-        """Makes the parameters views of the used part of the capacity, without gradients."""
-        for name in self._names:
+        """Makes parameters and anchors views of the used part of the capacity, without gradients."""
+        for name in (*self._names, ADDED_BY):
             setattr(self, name, self._storage[name][: self._size])
 
     def _reserve(self) -> None:

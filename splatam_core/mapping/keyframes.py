@@ -14,7 +14,6 @@ from torch import Tensor
 
 from splatam_core.config import KeyframeConfig, SlamConfig
 from splatam_core.geometry.camera import PinholeCamera
-from splatam_core.images.view import unproject
 from splatam_core.mapping.ghosts import without
 from splatam_core.mapping.posed import PosedFrame, PosedView
 
@@ -41,6 +40,10 @@ class KeyframeStore(Sequence[PosedView]):
     def __getitem__(self, index: Any) -> Any:
         """Returns keyframes in the host's memory."""
         return self._kept[index]
+
+    def __iter__(self) -> Iterator[PosedView]:
+        """Yields the keyframes in the host's memory, in a tenth of the time that ``Sequence`` takes."""
+        return iter(self._kept)
 
     def append(self, keyframe: PosedView, copy: PosedView | None = None) -> None:
         """Keeps one more keyframe; drops the least needed one beyond the budget.
@@ -195,16 +198,19 @@ def sample_points(posed: PosedView, count: int, rng: np.random.Generator) -> Ten
     depth = posed.view.depth
     readings = depth.numpy().reshape(-1)
     found = rng.integers(len(readings), size=_TRIES * count)
-    found = found[readings[found] > 0][:count]
+    z = readings[found]
+    has_reading = np.flatnonzero(z > 0)[:count]
+    found, z = found[has_reading], z[has_reading]
     if len(found) < count:  # there are too few readings to come upon them
         with_reading = np.flatnonzero(readings > 0)
         if len(with_reading) == 0:
             return depth.new_empty(0, 3)
         found = with_reading[rng.integers(len(with_reading), size=count)]
-    drawn = torch.from_numpy(found)
-    v, u = drawn // depth.shape[1], drawn % depth.shape[1]
-    points = unproject(posed.view.camera, u, v, depth[v, u])
-    return (points - posed.T_cam_world[:3, 3]) @ posed.T_cam_world[:3, :3]
+        z = readings[found]
+    camera = posed.view.camera
+    v, u = (pixels.astype(np.float32) for pixels in np.divmod(found, camera.width))
+    points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
+    return (torch.from_numpy(points) - posed.T_cam_world[:3, 3]) @ posed.T_cam_world[:3, :3]
 
 
 def overlaps(points: Tensor, camera: PinholeCamera, keyframes: Sequence[PosedView], margin: int) -> list[float]:
@@ -218,11 +224,15 @@ def overlaps(points: Tensor, camera: PinholeCamera, keyframes: Sequence[PosedVie
     for first in range(0, len(near), _BATCH):
         chosen = near[first : first + _BATCH]
         x, y, z = (T[chosen].reshape(-1, 4) @ homogeneous).reshape(-1, 3, len(points)).swapaxes(0, 1)  # [N, K] each
-        in_front = z > 0
-        inverse_z = 1 / np.where(in_front, z, np.float32(1))
-        u, v = camera.fx * x * inverse_z + camera.cx, camera.fy * y * inverse_z + camera.cy
-        inside = (u > margin) & (u < camera.width - margin) & (v > margin) & (v < camera.height - margin) & in_front
-        shares[chosen] = inside.mean(axis=1)
+        inside = z > 0
+        inverse_z = 1 / np.where(inside, z, np.float32(1))
+        for across, focal, centre, side in ((x, camera.fx, camera.cx, camera.width), (y, camera.fy, camera.cy, camera.height)):
+            pixels = focal * across
+            pixels *= inverse_z
+            pixels += centre
+            inside &= pixels > margin
+            inside &= pixels < side - margin
+        shares[chosen] = np.count_nonzero(inside, axis=1) / len(points)
     result: list[float] = shares.tolist()
     return result
 

@@ -24,7 +24,7 @@ from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.ghosts import moved_in
 from splatam_core.mapping.keyframes import KeyframeStore, Window, select_keyframes, views_to_fit
 from splatam_core.mapping.optimizers import TimeLimit, make_optimizer
-from splatam_core.mapping.posed import PosedFrame, PosedView
+from splatam_core.mapping.posed import Before, PosedFrame, PosedView
 from splatam_core.mapping.schedule import MappingPlan, MappingSchedule
 from splatam_core.rasterizer import Rasterizer
 from splatam_core.rasterizer.base import NOT_COMPARED
@@ -81,20 +81,22 @@ class Mapper:
         added = self._config.densification
         if not (plan.densifies and added.depth_noise_ratio > 0 and len(self.keyframes)):
             return frame
-        posed = PosedView(frame.device.view.narrowed(added.scale, added.max_width), frame.device.T_cam_world)
-        before = [self.keyframes.on_device(keyframe) for keyframe in self.keyframes[-_SEEN_BEFORE:]]
+        view = frame.device.view.narrowed(added.scale, added.max_width)
+        posed = PosedView(view, frame.device.T_cam_world)
+        earlier = [self.keyframes.on_device(keyframe) for keyframe in self.keyframes[-_SEEN_BEFORE:]]
         with torch.no_grad():
-            render = self._rasterizer.render(self.map.gaussians.detached(), posed.view.camera, posed.T_cam_world)
-            moving = moved_in(render, posed, before)
-        frame = replace(frame, before=render)
+            render = self._rasterizer.render(self.map.gaussians.detached(), view.camera, posed.T_cam_world)
+            moving = moved_in(render, posed, earlier)
         if moving is None:
-            return frame
+            return replace(frame, before=Before(view, render))
         _log.info('frame %d: something moves in %.0f %% of the view', frame.index, 100 * moving.float().mean())
         host = frame.observation.host
         size = host.camera.width, host.camera.height
         mask = nearest(moving.float().to(host.depth.device), *size) > 0.5
         host = replace(host, depth=torch.where(mask, NOT_COMPARED, host.depth))
-        return replace(frame, observation=Observation(host, host.to(frame.observation.device.depth.device)))
+        device = host.to(frame.observation.device.depth.device)
+        before = Before(device.narrowed(added.scale, added.max_width), render)
+        return replace(frame, observation=Observation(host, device), before=before)
 
     def densify(self, frame: PosedFrame, plan: MappingPlan) -> None:
         """Adds Gaussians where the frame shows what the map lacks."""
@@ -205,7 +207,7 @@ class Mapper:
 
     def _measure_scene(self, view: View) -> None:
         """Sets the scene radius from the first frame; a later frame that sees so far that new Gaussians are too wide raises it."""
-        config, deepest_m = self._config.mapping, float(view.depth.max())
+        config, deepest_m = self._config.mapping, float(view.depth.numpy().max())
         self.scene_radius = self.scene_radius or deepest_m / config.scene_radius_ratio
         if config.prune_scale > 0:
             added = self._config.densification

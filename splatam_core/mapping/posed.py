@@ -55,7 +55,20 @@ class PosedView:
 
     def bare(self) -> PosedView:
         """Returns the same without cached images: seven bytes a pixel."""
-        return PosedView(replace(self.view), self.T_cam_world, self.frame)
+        return PosedView(self.view.bare(), self.T_cam_world, self.frame)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Before:
+    """A frame and the map as it found it, at the size at which Gaussians are added.
+
+    Attributes:
+        view: the frame.
+        render: the map, from there.
+    """
+
+    view: View
+    render: Render
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,14 +80,14 @@ class PosedFrame:
         T_cam_world: [4, 4] float64.
         config: says at which size views are fitted.
         index: number of the frame.
-        before: the map as the frame found it, at the size at which Gaussians are added; None where it was not rendered.
+        before: the map as the frame found it; None where it was not rendered.
     """
 
     observation: Observation
     T_cam_world: NDArray[np.float64]
     config: MappingConfig
     index: int = -1
-    before: Render | None = None
+    before: Before | None = None
 
     @cached_property
     def host(self) -> PosedView:

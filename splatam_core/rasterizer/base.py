@@ -78,7 +78,7 @@ class Gaussians:
     anchors: Tensor | None = None
 
     def __len__(self) -> int:
-        return len(self.means)
+        return self.means.shape[0]
 
     def detached(self) -> Gaussians:
         """Returns the same values, detached from autograd."""

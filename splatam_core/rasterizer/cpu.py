@@ -59,12 +59,15 @@ class CpuRasterizer:
         _check(gaussians, T_cam_world)
         if gaussians.rotations is not None:
             return self._render_ellipses(project(gaussians, camera, T_cam_world), camera)
+        values = (
+            gaussians.means.contiguous(), gaussians.log_scales.contiguous(), gaussians.logit_opacities.contiguous(),
+            gaussians.rgb.contiguous(), T_cam_world,
+        )  # fmt: skip
+        given = _Pass(self._engine, camera, gaussians.bounds)
         with native_errors():
-            images = _Splat.apply(
-                gaussians.means.contiguous(), gaussians.log_scales.contiguous(), gaussians.logit_opacities.contiguous(),
-                gaussians.rgb.contiguous(), T_cam_world, _Pass(self._engine, camera, gaussians.bounds),
-            )  # fmt: skip
-        return Render(*images)
+            if torch.is_grad_enabled():
+                return Render(*_Splat.apply(*values, given))
+            return given.drawn(*values)[0]
 
     def _render_ellipses(self, ellipses: Ellipses, camera: PinholeCamera) -> Render:
         shapes = torch.cat([ellipses.centers, ellipses.conics, ellipses.opacities[:, None]], dim=1)
@@ -143,7 +146,7 @@ def _check_fit(gaussians: Gaussians, moments: Moments, target: Target) -> None:
 
 
 def _check_tensor(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> None:
-    if tensor.shape != shape or tensor.dtype != dtype or tensor.device.type != 'cpu':
+    if tensor.shape != shape or tensor.dtype != dtype or not tensor.is_cpu:
         raise RasterizerError(
             f'{name} is {tuple(tensor.shape)} {tensor.dtype} on {tensor.device}; the cpu rasterizer takes {shape} {dtype} on cpu'
         )
@@ -163,6 +166,22 @@ class _Pass:
     camera: PinholeCamera
     bounds: Tensor | None
 
+    def drawn(
+        self, means: Tensor, log_scales: Tensor, logit_opacities: Tensor, rgb: Tensor, T_cam_world: Tensor
+    ) -> tuple[Render, _native.View]:  # fmt: skip
+        """Draws isotropic Gaussians. Returns the images, and what the backward pass goes on with."""
+        size = self.camera.height, self.camera.width
+        images = Render(torch.empty(3, *size), torch.empty(size), torch.empty(size))
+        view = self.engine.forward(
+            **_arrays(Gaussians(means, log_scales, logit_opacities, rgb, self.bounds).detached()),
+            T_cam_world=T_cam_world.detach().numpy(),
+            camera=self.camera,
+            image=images.rgb.numpy(),
+            depth=images.depth_acc.numpy(),
+            silhouette=images.silhouette.numpy(),
+        )
+        return images, view
+
 
 class _Splat(torch.autograd.Function):
     """Isotropic Gaussians and a pose to colour, depth_acc and silhouette."""
@@ -171,17 +190,8 @@ class _Splat(torch.autograd.Function):
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, logit_opacities: Tensor, rgb: Tensor, T_cam_world: Tensor, given: _Pass
     ) -> tuple[Tensor, Tensor, Tensor]:
-        size = given.camera.height, given.camera.width
-        images = torch.empty(3, *size), torch.empty(size), torch.empty(size)
-        gaussians = Gaussians(means, log_scales, logit_opacities, rgb, given.bounds)
-        ctx.view = given.engine.forward(
-            **_arrays(gaussians.detached()),
-            T_cam_world=T_cam_world.detach().numpy(),
-            camera=given.camera,
-            image=images[0].numpy(),
-            depth=images[1].numpy(),
-            silhouette=images[2].numpy(),
-        )
+        render, ctx.view = given.drawn(means, log_scales, logit_opacities, rgb, T_cam_world)
+        images = render.rgb, render.depth_acc, render.silhouette
         ctx.engine = given.engine
         ctx.save_for_backward(means, log_scales, logit_opacities, rgb, *images)
         return images

@@ -240,6 +240,47 @@ class EvidenceSums(Protocol):
         """[9, cells] the sums of the cells."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Knowns:
+    """What is known beside the sums of the evidence.
+
+    Attributes:
+        camera: of the images compared.
+        step: every n-th pixel of every n-th row was compared.
+        velocity: [6] twist by which the pose at the colour image's time changes per unit of time offset.
+        prior: [9] inverse variances of the unknowns before the frame.
+        prior_inflation: factor by which the prior of the time offset is stronger than its own variance says.
+        is_free: [9] bool, which of the unknowns are solved for.
+    """
+
+    camera: PinholeCamera
+    step: int
+    velocity: Matrix
+    prior: Matrix
+    prior_inflation: float
+    is_free: NDArray[np.bool_]
+
+
+class PoseWeight(Protocol):
+    """How far a pose may be trusted: see ``tracking.evidence.Evidence``."""
+
+    @property
+    def covariance(self) -> Matrix:
+        """[6, 6]."""
+
+    @property
+    def num_open(self) -> int:
+        """Number of directions that the images do not determine."""
+
+    @property
+    def explained(self) -> float:
+        """Fraction of the cells that see the map in which brightness and depth fit."""
+
+    @property
+    def num_explained(self) -> int:
+        """Number of these cells."""
+
+
 class Aligner(Protocol[ImageT]):
     """The operations of direct alignment.
 
@@ -297,4 +338,15 @@ class Aligner(Protocol[ImageT]):
             at: both images, and the estimate.
             max_depth_error: relative depth by which a point near the map differs at most.
             step: every n-th pixel of every n-th row is compared.
+        """
+
+    def weigh(self, sums: EvidenceSums, known: Knowns) -> PoseWeight:
+        """Returns how far a pose may be trusted, as ``tracking.evidence.weigh`` does.
+
+        Args:
+            sums: at the pose.
+            known: what is known beside them.
+
+        Raises:
+            LinAlgError: rounding leaves no system of equations to solve.
         """

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatam_core.geometry.se3 import Matrix
 from splatam_core.tracking.aligner import AlignmentState, Descent, Linearization, LinearSystem
@@ -74,8 +75,10 @@ class Equations:
 
     def information(self, unknown: int) -> float:
         """Returns the inverse variance that the residuals claim for an unknown, the other free ones marginalized."""
-        others, H = [other for other in self._free if other != unknown], self.H + np.diag(self.task.information)
-        return float(self.H[unknown, unknown] - H[unknown, others] @ np.linalg.solve(H[np.ix_(others, others)], H[others, unknown]))
+        free, H = self._free, self.H + np.diag(self.task.information)
+        others = free[free != unknown]
+        among_others, across = H[others[:, None], others], H[others, unknown]
+        return float(self.H[unknown, unknown] - across @ np.linalg.solve(among_others, across))
 
     def step(self) -> Matrix | None:
         """Returns the step [10] of the free unknowns that minimises the residuals; None if they do not determine one.
@@ -87,14 +90,14 @@ class Equations:
         known, free, step = self.task.information, self._free, np.zeros(10)
         H, g = self.H + np.diag(known), self.g + known * self.off
         try:
-            step[free] = -np.linalg.solve(H[np.ix_(free, free)], g[free])
+            step[free] = -np.linalg.solve(H[free[:, None], free], g[free])
         except np.linalg.LinAlgError:
             return None
         return step
 
     @property
-    def _free(self) -> list[int]:
-        return [int(unknown) for unknown in np.flatnonzero(self.task.is_free)]
+    def _free(self) -> NDArray[np.intp]:
+        return np.flatnonzero(self.task.is_free)
 
 
 def _scales(system: LinearSystem) -> Matrix:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from splatam_core.geometry import se3
 from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.se3 import Matrix
-from splatam_core.tracking.aligner import EvidenceSums, Linearization
+from splatam_core.tracking.aligner import EvidenceSums, Knowns, Linearization
 
 Image = NDArray[np.float32]
 Values = NDArray[np.float32]
@@ -63,25 +63,6 @@ class Evidence:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Knowns:
-    """What is known beside the residuals.
-
-    Attributes:
-        camera: of the images compared.
-        velocity: [6] twist by which the pose at the colour image's time changes per unit of time offset.
-        prior: [9] inverse variances of the unknowns before the frame.
-        prior_inflation: factor by which the prior of the time offset is stronger than its own variance says.
-        free: indices of the unknowns that are solved for.
-    """
-
-    camera: PinholeCamera
-    velocity: Matrix
-    prior: Matrix
-    prior_inflation: float
-    free: list[int]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Sums:
     """See ``EvidenceSums``."""
 
@@ -112,17 +93,21 @@ def summed(at: Linearization[Image], max_depth_error: float, step: int) -> Sums:
 
 
 def weigh(sums: EvidenceSums, at: Knowns) -> Evidence:
-    """Returns what the residuals at the end of an alignment say about the pose."""
+    """Returns what the residuals at the end of an alignment say about the pose.
+
+    The native aligner does the same in ``csrc/weigh.cpp``, in a thirtieth of the time.
+    """
+    free = np.flatnonzero(at.is_free)
     of_others = np.diag(np.where(np.arange(_NUM_UNKNOWNS) < 6, 0.0, at.prior))
     of_twist = np.diag(at.prior) - of_others
-    claimed = _marginal(sums.claimed + of_others + of_twist, at.free)
+    claimed = _marginal(sums.claimed + of_others + of_twist, free)
     information = sums.shared + of_others
     by_chance = 1 / math.sqrt(max(1, int(sums.cells[0].sum())))
-    directions = _open_directions(claimed, _marginal(information, at.free), by_chance)
+    directions = _open_directions(claimed, _marginal(information, free), by_chance)
     covariance = _clustered(sums.scores, information + of_twist, at)
     left_open = directions @ directions.T @ claimed
     determined = np.eye(6) - left_open
-    fits, judged = _fitting_cells(sums.cells, at.camera)
+    fits, judged = _fitting_cells(sums.cells, _cell_sizes(at.camera, at.step))
     return Evidence(
         covariance=determined @ covariance @ determined.T + _UNKNOWN**2 * left_open @ left_open.T,
         num_open=directions.shape[1],
@@ -295,23 +280,22 @@ def _carried(points: Values, T: Image, readout: Image, times: Values) -> Values:
     return moved + times * (speed + np.float32(0.5) * times * (turn @ speed))
 
 
-def _fitting_cells(sums: Matrix, camera: PinholeCamera) -> tuple[Mask, Mask]:
-    """Returns [cells] which cells fit in brightness and in depth, and which see enough of the map to be judged."""
+def _fitting_cells(sums: Matrix, sizes: NDArray[np.intp]) -> tuple[Mask, Mask]:
+    """Returns [cells] which cells of some sizes fit in brightness and in depth, and which see enough of the map to be judged."""
     num_lit, num_met, num_near = sums[:3]
     mean, mean_found, square, square_found, product, difference = sums[3:] / np.maximum(num_lit, 1)
     spread, spread_found = square - mean**2, square_found - mean_found**2
     correlation = (product - mean * mean_found) / np.sqrt(np.maximum(spread * spread_found, 1e-12))
     fits = np.where(spread > _MIN_CONTRAST**2, correlation > _MIN_CORRELATION, difference < _MAX_DIFFERENCE)
-    enough = _MIN_FILLED * _cell_sizes(camera)
+    enough = _MIN_FILLED * sizes
     fits &= (num_met < enough) | (2 * num_near >= num_met)
     judged = (np.maximum(num_lit, num_met) >= enough) & (enough > 0)
     return fits & judged, judged
 
 
 @lru_cache(maxsize=4)
-def _cell_sizes(camera: PinholeCamera) -> NDArray[np.intp]:
+def _cell_sizes(camera: PinholeCamera, step: int) -> NDArray[np.intp]:
     """Returns [cells] how many pixels of each cell are compared where they have depth."""
-    step = step_of(camera)
     height, width = (len(range(step // 2, side, step)) for side in (camera.height, camera.width))
     return np.bincount(_cells(height, width), minlength=ROWS * COLUMNS)
 
@@ -340,11 +324,11 @@ def _normal_matrix(left: _Jacobians, right: _Jacobians, points: _Points) -> Matr
     return H
 
 
-def _marginal(H: Matrix, free: list[int]) -> Matrix:
+def _marginal(H: Matrix, free: NDArray[np.intp]) -> Matrix:
     """Returns the symmetric [6, 6] part of a normal matrix [9, 9] that is left for the twist, the other unknowns solved for."""
     H = 0.5 * (H + H.T)
-    others = [unknown for unknown in free if unknown >= 6]
-    if not others:
+    others = free[free >= 6]
+    if not len(others):
         return H[_TWIST, _TWIST]
     return H[_TWIST, _TWIST] - H[_TWIST, others] @ np.linalg.solve(H[np.ix_(others, others)], H[others, _TWIST])
 
@@ -368,7 +352,7 @@ def _clustered(scores: Matrix, information: Matrix, at: Knowns) -> Matrix:
     known_before[_TWIST] = 0  # of a step only
     known_before[_TIME_OFFSET] *= at.prior_inflation
     scatter += np.diag(known_before)
-    free = np.array(at.free)
+    free = np.flatnonzero(at.is_free)
     inverse = np.linalg.pinv(information[np.ix_(free, free)])
     covariance = np.zeros((_NUM_UNKNOWNS, _NUM_UNKNOWNS))
     covariance[np.ix_(free, free)] = inverse @ scatter[np.ix_(free, free)] @ inverse.T

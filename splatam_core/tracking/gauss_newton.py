@@ -8,12 +8,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatam_core.config import TrackingConfig
 from splatam_core.geometry.se3 import Matrix
-from splatam_core.tracking.aligner import Aligner, AlignmentState, Descent, LinearSystem
+from splatam_core.tracking.aligner import Aligner, AlignmentState, Descent, Knowns, Linearization, LinearSystem
 from splatam_core.tracking.descent import READOUT, TIME_OFFSET, Equations
-from splatam_core.tracking.evidence import Evidence, Knowns, max_depth_error, step_of, weigh
+from splatam_core.tracking.evidence import Evidence, max_depth_error, step_of
 from splatam_core.tracking.pace import Pace
 from splatam_core.tracking.pyramid import EDGE, Level
 from splatam_core.tracking.readout import ReadoutSeen
@@ -36,12 +37,18 @@ class _Known:
         time_offset: between colour and depth.
         pace: how the camera is expected to move from frame to frame.
         readout: how long reading an image takes; None where it is not estimated.
+        mean: see ``Descent``.
+        information: see ``Descent``.
+        is_free: see ``Descent``.
     """
 
     predicted_motion: Matrix | None
     time_offset: TimeOffset
     pace: Pace
     readout: ReadoutSeen | None
+    mean: Matrix
+    information: Matrix
+    is_free: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,30 +114,51 @@ class GaussNewton:
         Returns:
             The state found, or the start where that explains the finest level better.
         """
-        start = state = AlignmentState(np.eye(4) if start_motion is None else start_motion)
-        if self._estimates_time_offset and predicted_motion is not None:
-            state = replace(state, time_offset=time_offset.mean)
-        readout = pace.readout if self._estimates_readout and predicted_motion is not None else None
-        if readout is not None:
-            state = replace(state, readout=readout.mean)
-        known = _Known(predicted_motion, time_offset, pace, readout)
+        start = AlignmentState(np.eye(4) if start_motion is None else start_motion)
+        is_predicted = predicted_motion is not None
+        readout = pace.readout if self._estimates_readout and is_predicted else None
+        state = AlignmentState(
+            start.depth_motion,
+            time_offset=time_offset.mean if self._estimates_time_offset and is_predicted else 0.0,
+            readout=0.0 if readout is None else readout.mean,
+        )
+        known = self._known(predicted_motion, time_offset, pace, readout)
         for reference, frame in zip(reversed(references), reversed(frames), strict=True):
             task = self._task(reference, frame, known, _SMALL_STEP if reference is references[0] else _SMALL_COARSE_STEP)
             state = self._aligner.descend(task, state)
-        system = self._linearize(task, state)
+        at = task.at(state)
+        system = self._linearize(at)
         after, equations = time_offset, Equations.of(system, state, task)
         if self._estimates_time_offset:
             after = time_offset.updated(state.time_offset, equations.information(TIME_OFFSET))
         start = replace(start, scales=state.scales)
-        at_start = self._linearize(task, start)
-        if not _is_better(at_start, system):
-            return Alignment(start, at_start, time_offset, partial(self._weigh, task, start, known))
-        return Alignment(state, system, after, partial(self._weigh, task, state, known), _seen(equations, state, readout))
+        at_start = task.at(start)
+        system_at_start = self._linearize(at_start)
+        if not _is_better(system_at_start, system):
+            return Alignment(start, system_at_start, time_offset, partial(self._weigh, at_start, start, known))
+        return Alignment(state, system, after, partial(self._weigh, at, state, known), _seen(equations, state, readout))
+
+    def _known(
+        self, predicted_motion: Matrix | None, time_offset: TimeOffset, pace: Pace, seen: ReadoutSeen | None
+    ) -> _Known:  # fmt: skip
+        """Returns what is known at every level."""
+        readout, is_free = seen or ReadoutSeen(), np.zeros(_NUM_UNKNOWNS, dtype=np.bool_)
+        is_free[self._free], is_free[READOUT] = True, seen is not None
+        mean = np.array([0.0] * 6 + [1.0, 0.0, time_offset.mean, readout.mean])
+        information = np.array([*_PRIOR, time_offset.information, readout.information])
+        return _Known(
+            predicted_motion=predicted_motion,
+            time_offset=time_offset,
+            pace=pace,
+            readout=seen,
+            mean=mean,
+            information=information,
+            is_free=is_free,
+        )
 
     def _task(self, reference: Level, frame: Level, known: _Known, small_step: float) -> Descent[Any]:
         """Returns what is done at one level."""
-        config, readout, is_free = self._config, known.readout or ReadoutSeen(), np.zeros(_NUM_UNKNOWNS, dtype=np.bool_)
-        is_free[self._free], is_free[READOUT] = True, known.readout is not None
+        config = self._config
         # What lies between readings repeats their errors, and adds some.
         weights = np.array([config.color_weight, config.depth_weight * frame.depth_share])
         return Descent(
@@ -141,23 +169,24 @@ class GaussNewton:
             max_depth_ratio=2 * EDGE,
             predicted_motion=known.predicted_motion,
             pace=known.pace,
-            mean=np.array([0.0] * 6 + [1.0, 0.0, known.time_offset.mean, readout.mean]),
-            information=np.array([*_PRIOR, known.time_offset.information, readout.information]),
-            is_free=is_free,
+            mean=known.mean,
+            information=known.information,
+            is_free=known.is_free,
             scale_factors=1 / np.sqrt(np.maximum(weights, _LEAST_WEIGHT)),
             iterations=config.iterations,
             small_step=small_step,
         )
 
-    def _linearize(self, task: Descent[Any], state: AlignmentState) -> LinearSystem:
-        config = self._config
-        return self._aligner.linearize(task.at(state), inlier_color=config.inlier_color, inlier_depth=config.inlier_depth)
+    def _linearize(self, at: Linearization[Any]) -> LinearSystem:
+        return self._aligner.linearize(at, inlier_color=self._config.inlier_color, inlier_depth=self._config.inlier_depth)
 
-    def _weigh(self, task: Descent[Any], state: AlignmentState, known: _Known) -> Evidence:
-        at = task.at(state)
-        sums = self._aligner.evidence(at, max_depth_error=max_depth_error(at.depth_scale), step=step_of(at.camera))
-        prior = task.information[:READOUT]
-        return weigh(sums, Knowns(at.camera, state.velocity, prior, known.time_offset.inflation, self._free))
+    def _weigh(self, at: Linearization[Any], state: AlignmentState, known: _Known) -> Evidence:
+        step = step_of(at.camera)
+        sums = self._aligner.evidence(at, max_depth_error=max_depth_error(at.depth_scale), step=step)
+        prior, is_free = known.information[:READOUT], known.is_free[:READOUT]
+        knowns = Knowns(at.camera, step, state.velocity, prior, known.time_offset.inflation, is_free)
+        found = self._aligner.weigh(sums, knowns)
+        return Evidence(found.covariance, found.num_open, found.explained, found.num_explained, 1 / at.camera.fx)
 
 
 def _seen(equations: Equations, state: AlignmentState, known: ReadoutSeen | None) -> ReadoutSeen | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -82,10 +83,15 @@ def full_pyramid(level: Level, aligner: Aligner[Any]) -> list[Level]:
 
 def _halved(level: Level, aligner: Aligner[Any]) -> Iterator[Level]:
     while min(level.camera.width, level.camera.height) >= 2 * _COARSEST_PX:
-        width, height = level.camera.width // 2, level.camera.height // 2
-        camera = level.camera.cropped(2 * width, 2 * height).resized(width, height)
-        level = Level(camera, *aligner.halve(level.brightness, level.depth, EDGE), level.depth_share)
+        level = Level(_halved_camera(level.camera), *aligner.halve(level.brightness, level.depth, EDGE), level.depth_share)
         yield level
+
+
+@lru_cache(maxsize=16)
+def _halved_camera(camera: PinholeCamera) -> PinholeCamera:
+    """Cached, because every frame has the cameras of the one before."""
+    width, height = camera.width // 2, camera.height // 2
+    return camera.cropped(2 * width, 2 * height).resized(width, height)
 
 
 def _for_aligner(image: Tensor) -> Any:

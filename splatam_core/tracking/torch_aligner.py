@@ -17,9 +17,9 @@ from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.filters import brightness, luminance
 from splatam_core.rasterizer import Render
-from splatam_core.tracking.aligner import AlignmentState, Descent, EvidenceSums, Linearization
+from splatam_core.tracking.aligner import AlignmentState, Descent, EvidenceSums, Knowns, Linearization
 from splatam_core.tracking.descent import descend
-from splatam_core.tracking.evidence import summed
+from splatam_core.tracking.evidence import Evidence, summed, weigh
 
 _UNKNOWNS = 9
 _BINS = 1024  # of the histogram of absolute residuals, an eighth of an octave each
@@ -115,6 +115,10 @@ class TorchAligner:
     def evidence(self, at: Linearization[Tensor], *, max_depth_error: float, step: int) -> EvidenceSums:
         """See ``Aligner.evidence``. On the host."""
         return summed(at.converted(lambda image: image.numpy(force=True)), max_depth_error, step)
+
+    def weigh(self, sums: EvidenceSums, known: Knowns) -> Evidence:
+        """See ``Aligner.weigh``."""
+        return weigh(sums, known)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -92,9 +92,11 @@ def widened(best: TrackingResult, found: Sequence[TrackingResult], config: Track
     """
     if best.evidence is None:
         return best
-    alike = [result for result in found if result is best or _explain_alike(best, result, config)]
+    alike = [result for result in found if result is not best and _explain_alike(best, result, config)]
+    if not alike:
+        return best
     apart = np.array([se3.log(result.T_cam_world_depth @ se3.inverse(best.T_cam_world_depth)) for result in alike])
-    covariance = best.evidence.covariance + apart.T @ apart / len(alike)
+    covariance = best.evidence.covariance + apart.T @ apart / (1 + len(alike))
     return replace(best, evidence=replace(best.evidence, covariance=covariance))
 
 
@@ -271,7 +273,7 @@ class Judge:
         is_elsewhere = bool(jump) or is_ambiguous  # or where it was expected: the next pose must not be drawn to this one
         self.state = replace(
             self.state,
-            covariance=blend.covariance + is_elsewhere * np.outer(step, step),
+            covariance=blend.covariance + np.outer(step, step) if is_elsewhere else blend.covariance,
             has_jumped=bool(jump),
             is_in_doubt=bool(reason),
             unseen_s=blend.unseen_share * (self.state.unseen_s + min(prediction.seconds, _LONGEST_GAP)),
@@ -279,7 +281,8 @@ class Judge:
         covariance, result = blend.covariance, blend.applied(result)
         if reason:
             covariance = covariance + np.outer(step, step) + config.max_error_m**2 * np.eye(6)
-        turn = np.kron(np.eye(2), result.T_cam_world[:3, :3].T)
+        turn = np.zeros((6, 6))
+        turn[:3, :3] = turn[3:, 3:] = result.T_cam_world[:3, :3].T
         return result, Verdict(
             status=Status.UNCERTAIN if reason else Status.TRACKED,
             reason=reason,
@@ -418,4 +421,5 @@ def _lengths(twist: Matrix) -> tuple[float, float]:
 
 def _deviations(covariance: Matrix) -> tuple[float, float]:
     """Returns the standard deviations of position and rotation, over all axes, of a covariance [6, 6]."""
-    return math.sqrt(max(0.0, np.trace(covariance[:3, :3]))), math.sqrt(max(0.0, np.trace(covariance[3:, 3:])))
+    x, y, z, *rotation = covariance.diagonal().tolist()  # single numbers: see ``se3.exp``
+    return math.sqrt(max(0.0, x + y + z)), math.sqrt(max(0.0, sum(rotation)))

@@ -100,6 +100,17 @@ def evidence(**changed: object) -> None:
     _native.Aligner(1).evidence(linearization(**changed), max_depth_error=0.1, step=2)
 
 
+def weigh(**changed: object) -> None:
+    sums = {'claimed': np.eye(9), 'shared': np.eye(9), 'scores': np.ones((9, 48)), 'cells': np.ones((9, 48))}
+    known = {
+        'camera': CAMERA, 'step': 1, 'velocity': np.zeros(6), 'prior': np.ones(9), 'prior_inflation': 1.0,
+        'is_free': np.ones(9, bool),
+    }  # fmt: skip
+    for name, value in changed.items():
+        (sums if name in sums else known)[name] = value
+    _native.Aligner(1).weigh(SimpleNamespace(**sums), SimpleNamespace(**known))
+
+
 def halve(**changed: object) -> None:
     arguments = {'brightness': floats(HEIGHT, WIDTH), 'depth': floats(HEIGHT, WIDTH), 'max_step': 0.1}
     _native.Aligner(1).halve(**(arguments | changed))
@@ -233,6 +244,26 @@ def test_what_a_descent_knows_is_checked(name: str, shape: tuple[int, ...]) -> N
         descend(is_free=np.ones(10))
     with pytest.raises(TypeError, match='task has no brightness; expected a Descent'):
         _native.Aligner(1).descend(SimpleNamespace(), SimpleNamespace())
+
+
+@pytest.mark.parametrize(
+    ('name', 'shape'),
+    [('claimed', (9, 9)), ('shared', (9, 9)), ('scores', (9, 48)), ('cells', (9, 48)), ('velocity', (6,)), ('prior', (9,))],
+)
+def test_what_is_weighed_is_checked(name: str, shape: tuple[int, ...]) -> None:
+    weigh(**{name: np.ones(shape)} if name not in ('claimed', 'shared') else {})
+    for value in (np.ones(shape, np.float32), np.ones((*shape, 1)), np.ones((shape[0] - 1, *shape[1:])), [1.0], 'text'):
+        with pytest.raises(TypeError, match=f'{name} is .* expected'):
+            weigh(**{name: value})
+    for wrong_number in ({'step': 2.5}, {'prior_inflation': 'text'}):
+        with pytest.raises(TypeError, match=f'{next(iter(wrong_number))} is no number'):
+            weigh(**wrong_number)
+    with pytest.raises(ValueError, match='step is 0'):
+        weigh(step=0)
+    with pytest.raises(TypeError, match='is_free is .* expected'):
+        weigh(is_free=np.ones(9))
+    with pytest.raises(TypeError, match='sums has no claimed; expected EvidenceSums'):
+        _native.Aligner(1).weigh(SimpleNamespace(), SimpleNamespace())
 
 
 def test_a_depth_of_another_size_than_the_image_is_refused() -> None:

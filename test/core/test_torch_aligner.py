@@ -23,9 +23,9 @@ from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.rasterizer.native import make_native_aligner
 from splatam_core.slam import Slam
 from splatam_core.tracking import TorchAligner, alignment, make_tracker
-from splatam_core.tracking.aligner import AlignmentState, Descent, EvidenceSums, Linearization
+from splatam_core.tracking.aligner import AlignmentState, Descent, EvidenceSums, Knowns, Linearization
 from splatam_core.tracking.descent import descend
-from splatam_core.tracking.evidence import step_of
+from splatam_core.tracking.evidence import Evidence, Sums, step_of, weigh
 from splatam_core.tracking.pace import Pace
 from splatam_core.tracking.torch_aligner import TorchLinearSystem
 from splatam_core.tracking.verdict import verify
@@ -208,6 +208,44 @@ def test_evidence_is_the_native_one(size: tuple[int, int], time_offset: float, r
         assert np.array_equal(ours, getattr(again, name)), name
 
 
+WEIGHED = {
+    'all unknowns': (range(9), 0.0),
+    'no time offset': (range(8), 0.0),
+    'camera alone': (range(6), 0.0),
+    'of other images': (range(9), 1.0),
+    'nothing in sight': (range(9), np.nan),
+}
+
+
+@pytest.mark.parametrize('size', [(48, 65), (240, 320), (7, 9)])
+@pytest.mark.parametrize(('is_free', 'noise'), WEIGHED.values(), ids=WEIGHED)
+def test_weighing_is_the_native_one(is_free: Sequence[int], noise: float, size: tuple[int, int]) -> None:
+    """To the rounding of doubles in systems of which the numbers differ by a millionfold; the same directions and cells."""
+    native, camera, at_once = make_native_aligner(1), _camera(size), _settings(se3.exp(TWIST), se3.exp(TWIST), 1.05, 0.01)
+    brightness, depth = _picture(1, size)
+    other = brightness + np.float32(noise) * np.random.default_rng(3).random(size, np.float32)
+    at = _at((brightness, depth * np.float32(1 + 0 * noise)), native.layers(other, 1.002 * depth, EDGE), camera=camera, **at_once)
+    sums = native.evidence(at, max_depth_error=0.03, step=step_of(camera))
+    prior = np.array([10.0] * 6 + [100, 100, 20])
+    known = Knowns(camera, step_of(camera), VELOCITY.astype(np.float64), prior, 7.0, np.isin(np.arange(9), is_free))
+    expected, found = weigh(sums, known), native.weigh(sums, known)
+    assert (found.num_open, found.num_explained) == (expected.num_open, expected.num_explained)
+    assert found.explained == expected.explained
+    deviations = np.sqrt(expected.covariance.diagonal())
+    assert np.abs(found.covariance - expected.covariance).max() <= 1e-9 * np.outer(deviations, deviations).max()
+
+
+@pytest.mark.parametrize('name', ['claimed', 'shared'])
+@pytest.mark.parametrize('value', [np.nan, np.inf])
+def test_equations_that_have_no_solution_are_the_same_error_by_either(name: str, value: float) -> None:
+    sums = {'claimed': np.eye(9), 'shared': np.eye(9), 'scores': np.ones((9, 48)), 'cells': np.ones((9, 48))}
+    sums[name][2, 3] = sums[name][3, 2] = value
+    known = Knowns(_camera((48, 64)), 1, np.zeros(6), np.ones(9), 1.0, np.ones(9, bool))
+    for either in (weigh, make_native_aligner(1).weigh):
+        with np.errstate(all='ignore'), pytest.raises(np.linalg.LinAlgError):
+            either(Sums(**sums), known)
+
+
 def _descent(size: tuple[int, int], is_free: Sequence[int] = range(10), **changed: Any) -> Descent[Any]:
     """A frame that was taken near its reference, with another exposure."""
     rng, (brightness, depth) = np.random.default_rng(7), _picture(1, size)
@@ -319,6 +357,9 @@ class _Bridge:
 
     def evidence(self, at: Linearization[Any], **settings: Any) -> EvidenceSums:
         return self._aligner.evidence(_on_device(at), **settings)
+
+    def weigh(self, sums: EvidenceSums, known: Knowns) -> Evidence:
+        return self._aligner.weigh(sums, known)
 
     def descend(self, task: Descent[Any], start: AlignmentState) -> AlignmentState:
         return self._aligner.descend(_task_on_device(task), start)

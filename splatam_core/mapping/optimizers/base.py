@@ -89,7 +89,7 @@ def prune(gaussian_map: GaussianMap, config: MappingConfig, scene_radius: float,
     if (broken := unusable(gaussian_map)) is not None:
         chosen = chosen | broken
         gaussian_map.refuse(int(broken.sum()))
-    if broken is not None or min_fraction is None or torch.count_nonzero(chosen) > min_fraction * len(gaussian_map):
+    if broken is not None or min_fraction is None or _count(chosen) > min_fraction * len(gaussian_map):
         gaussian_map.keep(~chosen)
 
 
@@ -98,7 +98,9 @@ def prunable(gaussian_map: GaussianMap, min_opacity: float, max_scale_m: float) 
     logits, widest = gaussian_map.logit_opacities.detach(), _widest(gaussian_map.log_scales.detach())
     faintest, limit = _logit(min_opacity), _log(max_scale_m)
     if is_on_host(logits):  # numpy takes a fifth of torch's time, and every frame looks at the whole map
-        return torch.from_numpy((logits.numpy() < faintest) | (widest.numpy() > limit))
+        chosen = logits.numpy() < faintest
+        chosen |= widest.numpy() > limit
+        return torch.from_numpy(chosen)
     return (logits < faintest) | (widest > limit)
 
 
@@ -111,21 +113,24 @@ def drop_unusable(gaussian_map: GaussianMap) -> None:
 
 def unusable(gaussian_map: GaussianMap) -> Tensor | None:
     """Returns [N] which Gaussians are not ``Gaussians.usable``; None if all are, as far as a quick look at the sums shows."""
-    gaussians = gaussian_map.gaussians.detached()
-    parts = [gaussians.means, gaussians.log_scales, gaussians.logit_opacities, gaussians.rgb]
-    parts += [] if gaussians.rotations is None else [gaussians.rotations]
-    if is_on_host(gaussians.means):
+    parts = [gaussian_map.means, gaussian_map.log_scales, gaussian_map.logit_opacities, gaussian_map.rgb]
+    parts = [values.detach() for values in (*parts, gaussian_map.rotations) if values is not None]
+    if is_on_host(gaussian_map.means):
         total = sum(float(values.numpy().sum()) for values in parts)  # as in `prunable`
     else:
         total = float(torch.stack([values.sum() for values in parts]).sum())
     if math.isfinite(total):
         return None
-    broken = ~gaussians.usable()
+    broken = ~gaussian_map.gaussians.usable()
     return broken if broken.any() else None
 
 
 def _widest(log_scales: Tensor) -> Tensor:
     return log_scales[:, 0] if log_scales.shape[1] == 1 else log_scales.amax(dim=1)  # amax would copy a single column
+
+
+def _count(mask: Tensor) -> int:
+    return int(np.count_nonzero(mask.numpy()) if is_on_host(mask) else torch.count_nonzero(mask))
 
 
 def _logit(p: float) -> float:

@@ -12,7 +12,7 @@ from splatam_core.config import MappingConfig
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.optimizers.base import TimeLimit, prune, rates
 from splatam_core.mapping.posed import PosedView
-from splatam_core.rasterizer import Rasterizer, Rates, Target
+from splatam_core.rasterizer import Gaussians, Moments, Rasterizer, Rates, Target
 from splatam_core.rasterizer.base import COLOR_LIMIT
 
 CORRECTED_PASSES = 2
@@ -37,8 +37,9 @@ class FusedOptimizer:
 
     def fit(self, gaussian_map: GaussianMap, views: Iterable[PosedView], scene_radius: float) -> None:
         """See ``MapOptimizer.fit``."""
+        gaussians, moments, usual = gaussian_map.gaussians, gaussian_map.moments, rates(self._config)
         for posed in views:
-            self._step(gaussian_map, posed, rates(self._config), self._config.fused.tolerance)
+            self._step(gaussians, moments, posed, usual, self._config.fused.tolerance)
         prune(gaussian_map, self._config, scene_radius, self._config.fused.prune_fraction)
 
     def finish(
@@ -47,6 +48,7 @@ class FusedOptimizer:
     ) -> int:  # fmt: skip
         """See ``MapOptimizer.finish``. Decreasing step sizes bring back what few steps a frame had forgotten."""
         passes = self._config.fused.final_passes * (CORRECTED_PASSES if is_corrected else 1)
+        gaussians, moments = gaussian_map.gaussians, gaussian_map.moments
         num_steps, began_s = passes * len(keyframes), time.monotonic()
         for step in range(num_steps):
             if step % len(keyframes) == 0:
@@ -56,10 +58,11 @@ class FusedOptimizer:
                 done = time_used
             if done >= 1 or limit.stop():
                 return step
-            self._step(gaussian_map, keyframes[int(order[step % len(keyframes)])], _final_rates(self._config, done), tolerance=0.0)
+            posed = keyframes[int(order[step % len(keyframes)])]
+            self._step(gaussians, moments, posed, _final_rates(self._config, done), tolerance=0.0)
         return num_steps
 
-    def _step(self, gaussian_map: GaussianMap, posed: PosedView, rates: Rates, tolerance: float) -> None:
+    def _step(self, gaussians: Gaussians, moments: Moments, posed: PosedView, rates: Rates, tolerance: float) -> None:
         view, config = posed.view, self._config
         enough = config.color_weight * tolerance**2 / (2 * COLOR_LIMIT)  # the Huber loss of an error of colour alone
         target = Target(
@@ -71,7 +74,7 @@ class FusedOptimizer:
             depth_weight=config.depth_weight,
             enough=enough,
         )
-        self._rasterizer.fit(gaussian_map.gaussians, gaussian_map.moments, rates, target)
+        self._rasterizer.fit(gaussians, moments, rates, target)
 
 
 def _final_rates(config: MappingConfig, done: float) -> Rates:

@@ -204,6 +204,26 @@ def linearize(values: Values, tally: Tally) -> None:
         assert np.isfinite(system.H).all() and np.isfinite(system.g).all()
 
 
+def weigh(values: Values, tally: Tally) -> None:
+    width, height = values.call.size
+    root = values.floats(9, 20, low=-1).astype(np.float64)
+    sums = {
+        'claimed': root @ root.T, 'shared': root @ root.T + values.floats(9, 9, low=-0.1).astype(np.float64),
+        'scores': values.floats(9, 48, low=-1).astype(np.float64), 'cells': values.floats(9, 48, high=9).astype(np.float64),
+    }  # fmt: skip
+    arguments = values.spoilt(sums | {
+        'velocity': values.floats(6, low=-1).astype(np.float64), 'prior': values.floats(9).astype(np.float64),
+        'prior_inflation': values.scalar(1.0), 'step': int(values.rng.choice([1, 1, 2, 4, 0, -1, 2**31 - 1])),
+        'is_free': values.rng.random(9) < 0.8, 'camera': values.camera(),
+    })  # fmt: skip
+    given = SimpleNamespace(**arguments)
+    found = tally.attempt(partial(_native.Aligner(1).weigh, given, given), *REFUSED, np.linalg.LinAlgError)
+    if found is not None:
+        assert 0 <= found.num_open <= 6 and 0 <= found.explained <= 1 and 0 <= found.num_explained <= 48
+    if found is not None and is_sound(values):
+        assert np.isfinite(found.covariance).all()
+
+
 def pyramid(values: Values, tally: Tally) -> None:
     aligner = _native.Aligner(values.call.threads)
     arguments = values.spoilt({
@@ -258,8 +278,8 @@ def blend(values: Values, tally: Tally) -> None:
 
 
 NATIVE_CALLS: dict[str, Callable[[Values, Tally], None]] = {
-    'forward': forward, 'backward': backward, 'fit': fit, 'linearize': linearize, 'pyramid': pyramid, 'levels': levels,
-    'blend': blend,
+    'forward': forward, 'backward': backward, 'fit': fit, 'linearize': linearize, 'weigh': weigh, 'pyramid': pyramid,
+    'levels': levels, 'blend': blend,
 }  # fmt: skip
 
 
