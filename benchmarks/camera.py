@@ -2,7 +2,9 @@
 
     python benchmarks/camera.py BAG LOG [--rate 30] [--frames N] [--now]
 
-``splatam convert`` wrote BAG. It is read into memory first; publishing starts when every topic has a subscriber.
+``splatam convert`` wrote BAG. It is read into memory first, as serialized messages, because a driver reads no files either.
+Publishing starts a second after every topic has a subscriber: until the subscriber knows the publisher, too, images wait, and then
+they arrive all at once.
 LOG gets a line for each frame: its stamp, and the wall time at which the later of its two images was handed to ROS, in nanoseconds.
 """
 
@@ -29,6 +31,7 @@ from splatam_ros.process import StopRequest, ros
 TOPICS = (INFO_TOPIC, RGB_TOPIC, DEPTH_TOPIC)
 AS_DRIVERS_DO = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 DISCOVERY_S = 60.0
+SETTLING_S = 1.0
 Frame = dict[str, bytes]
 
 
@@ -88,6 +91,7 @@ def main() -> None:
             if time.monotonic() > deadline_s:
                 sys.exit(f'camera: nobody subscribes to {", ".join(TOPICS)}')
             time.sleep(0.05)
+        time.sleep(SETTLING_S)
         with args.log.open('w') as log:
             log.writelines(publish(publishers, frames, args, stop))
         time.sleep(1.0)  # so that the subscribers can take the last messages

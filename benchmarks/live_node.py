@@ -62,7 +62,7 @@ class Run:
 def count(published_ns: dict[int, int], poses: list[Arrival], done: list[Arrival]) -> Counts:
     """Count frames and measure latencies.
 
-    The first frames arrive together, because discovery between reader and writer takes up to 0.4 s.
+    Frames that arrive while the first one starts the map are dropped, and are not counted here.
     """
     first, answers = poses[0], {item.stamp_ns for item in done}
     counted = {stamp_ns: at_ns for stamp_ns, at_ns in published_ns.items() if at_ns > first.received_ns}

@@ -1,16 +1,29 @@
-"""Being told to stop: the signals that ask for it, and how a long frame ends early, between two of its steps."""
+"""Being told to stop, or to hurry: the signals that ask for it, and how a long frame ends early, between two of its steps."""
 
 from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from enum import Enum
 from types import FrameType
 
 from splatam_core.errors import FrameError
 
 Stop = Callable[[], bool]
 """Asked before each step; no further step is taken once it returns True."""
+
+
+class Pressure(Enum):
+    """What waits for the present frame to be done."""
+
+    NONE = 'nothing'
+    WAITING = 'the next frame, or a call'
+    FULL = 'as many frames as can wait: the next one costs one of them'
+
+
+PressureGauge = Callable[[], Pressure]
+"""Asked before each optimization step, which is postponed while others wait."""
 
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -39,6 +52,11 @@ def on_stop_signals(handler: Callable[[int, FrameType | None], None]) -> Iterato
 def never() -> bool:
     """Never stops."""
     return False
+
+
+def no_pressure() -> Pressure:
+    """Nothing ever waits, as in a recording."""
+    return Pressure.NONE
 
 
 def check(stop: Stop) -> None:

@@ -24,7 +24,7 @@ from splatam_core.graph.relocalisation import Relocaliser, RelocaliserState, Sig
 from splatam_core.images.observation import Observation
 from splatam_core.images.spacing import describe_spacing
 from splatam_core.images.view import View
-from splatam_core.interruption import Stop, never
+from splatam_core.interruption import PressureGauge, Stop, never
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.mapper import Mapper
 from splatam_core.mapping.optimizers.base import TimeLimit
@@ -65,6 +65,7 @@ class CurrentFrame:
     def result(
         self, verdict: Verdict, T_world_cam: Matrix | None, slam: SlamLifecycle, *,
         tracking: TrackingResult | None = None, is_keyframe: bool = False, is_relocalised: bool = False,
+        postponed_steps: int = 0,
     ) -> FrameResult:  # fmt: skip
         """Returns the result of this frame."""
         is_first = verdict.status is Status.INITIALIZED
@@ -83,6 +84,7 @@ class CurrentFrame:
             num_held=verdict.num_held,
             is_relocalised=is_relocalised,
             T_world_odom=self.T_world_odom,
+            postponed_steps=postponed_steps,
         )
 
 
@@ -385,6 +387,10 @@ class SlamLifecycle:
             self._mapper.correct(corrections.at)
             self._motion.correct(corrections.motions[-1])
             self.places.follow(self._mapper.keyframes)
+
+    def catch_up(self, pressure: PressureGauge) -> None:
+        """After a frame that was mapped: takes the optimization steps that were postponed, until something waits."""
+        self._mapper.catch_up(pressure)
 
     def snapshot(self) -> MapSnapshot:
         """Returns a copy of the map."""

@@ -13,6 +13,7 @@ from splatam_core.geometry import se3
 from splatam_core.graph.relocalisation import unknown
 from splatam_core.images.observation import Observation
 from splatam_core.images.view import View
+from splatam_core.interruption import PressureGauge, no_pressure
 from splatam_core.lifecycle import CurrentFrame, SlamLifecycle
 from splatam_core.mapping.posed import PosedFrame
 from splatam_core.tracking import TrackingResult
@@ -35,8 +36,8 @@ def _solvable() -> Iterator[None]:
 class Slam(SlamLifecycle):
     """The algorithm on one page; ``SlamLifecycle`` holds the rest."""
 
-    def process(self, frame: RgbdFrame) -> FrameResult:
-        """Finds the pose of a frame, then adds what the frame shows to the map.
+    def process(self, frame: RgbdFrame, pressure: PressureGauge = no_pressure) -> FrameResult:
+        """Finds the pose of a frame, then adds what it shows to the map; steps of that are postponed as ``pressure`` says.
 
         Raises:
             FrameError: the frame has another camera than the first one, or is not later than the last one.
@@ -77,15 +78,16 @@ class Slam(SlamLifecycle):
         current.clock.lap('densify')
         window = self._mapper.select(posed, plan)
         current.clock.lap('keyframes')
-        self._mapper.optimize(window, plan)
+        postponed = self._mapper.optimize(window, plan, pressure)
         current.clock.lap('map')
         if plan.is_keyframe or verdict.corrects:
             self._note_place(seen, current.index)
         self._follow_graph(current, T_world_cam, tracked.evidence, None if found is None else found.keyframe)
         current.clock.lap('graph')
         return current.result(
-            verdict, T_world_cam, self, tracking=tracked, is_keyframe=plan.is_keyframe, is_relocalised=found is not None
-        )
+            verdict, T_world_cam, self, tracking=tracked, is_keyframe=plan.is_keyframe, is_relocalised=found is not None,
+            postponed_steps=postponed,
+        )  # fmt: skip
 
     def _find(self, view: View, predictions: list[Prediction]) -> tuple[TrackingResult, Verdict]:
         """Finds the pose of a view: from the last pose, and where that is uncertain, also from the last one to be trusted."""

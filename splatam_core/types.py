@@ -107,6 +107,7 @@ class FrameResult:
         is_relocalised: True if the camera was found anew in the map: its pose does not follow from the frame before.
         T_world_odom: [4, 4] all corrections of the world before this frame, and the unknown ways of a camera that was found
             elsewhere: its pose is this times one that never jumps.
+        postponed_steps: number of optimization steps that were postponed, because the next frame waited already.
     """
 
     index: int
@@ -123,6 +124,7 @@ class FrameResult:
     num_held: int = 0
     is_relocalised: bool = False
     T_world_odom: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    postponed_steps: int = 0
 
 
 @dataclass(frozen=True, slots=True)

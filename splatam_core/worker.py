@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from splatam_core.interruption import never
+from splatam_core.interruption import Pressure, never
 from splatam_core.types import FrameResult, RgbdFrame
 
 if TYPE_CHECKING:
@@ -28,7 +28,8 @@ class SlamWorker:
     """Owns a Slam. Only the worker's thread may use it, until ``stop`` has returned.
 
     Frames wait in a bounded queue and are processed in the order of submission. When the queue is full,
-    use ``drop_oldest`` for a live camera and ``block`` for a recording.
+    use ``drop_oldest`` for a live camera and ``block`` for a recording. With ``drop_oldest``, frames that wait postpone the
+    optimization of the map; it catches up while none waits.
 
     An exception costs the frame that caused it: it is reported, and the next frame is processed. Only what is no
     ``Exception``, such as SystemExit, stops the worker: waiting frames are dropped, ``submit`` raises WorkerStopped,
@@ -166,6 +167,15 @@ class SlamWorker:
             raise self._error
         return num_dropped
 
+    def _pressure(self) -> Pressure:
+        """Returns what waits for the present frame to be done. A recording waits as long as that takes."""
+        if self._when_full == 'block':
+            return Pressure.NONE
+        with self._changed:
+            if len(self._frames) == self._queue_size:
+                return Pressure.FULL
+            return Pressure.WAITING if self._frames or self._tasks or self._stopping else Pressure.NONE
+
     def _accepts_or_stops(self) -> bool:
         return self._stopping or len(self._frames) < self._queue_size
 
@@ -208,7 +218,10 @@ class SlamWorker:
         try:
             if self._before_frame is not None:
                 self._before_frame(self._slam, frame)
-            self._on_result(frame, self._slam.process(frame))
+            result = self._slam.process(frame, self._pressure)
+            self._on_result(frame, result)
+            if result.status.is_trusted:
+                self._slam.catch_up(self._pressure)
         except Exception as error:  # noqa: BLE001 - whatever it is, the next frame may be fine
             self._report_bad_frame(frame, error)
 

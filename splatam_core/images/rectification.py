@@ -184,7 +184,9 @@ def kept(depth_m: NDArray[np.floating[Any]], chosen: NDArray[np.bool_]) -> NDArr
 
 
 def _clean(depth_m: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-    """Returns [H, W] with 0 where there is no reading."""
+    """Returns [H, W] with 0 where there is no reading; the image itself where that is so already, as decoders leave it."""
+    if depth_m.dtype == np.float32 and depth_m.flags.carray and depth_m.min() >= 0 and depth_m.max() < np.inf:  # false for NaN
+        return np.asarray(depth_m, np.float32)
     return kept(depth_m, (depth_m > 0) & (depth_m < np.inf))
 
 

@@ -18,7 +18,8 @@ from splatam_core.geometry import se3
 from splatam_core.images.filters import nearest
 from splatam_core.images.observation import Observation
 from splatam_core.images.view import View, narrowing
-from splatam_core.interruption import Stop, never
+from splatam_core.interruption import Pressure, PressureGauge, Stop, never, no_pressure
+from splatam_core.mapping.backlog import StepBacklog
 from splatam_core.mapping.densification import densify
 from splatam_core.mapping.gaussian_map import GaussianMap
 from splatam_core.mapping.ghosts import moved_in
@@ -49,6 +50,7 @@ class Mapper:
         schedule: decides what each frame is used for.
         rng: draws every random choice.
         scene_radius: metres; 0 before the first frame.
+        backlog: the optimization steps that were postponed.
     """
 
     def __init__(
@@ -67,6 +69,8 @@ class Mapper:
         self.keyframes = KeyframeStore(device, config.keyframes)
         self.rng = np.random.default_rng(config.seed)
         self.scene_radius = 0.0
+        self.backlog = StepBacklog()
+        self._last_window = self.keyframes.window([])
         self._rasterizer, self._num_frames, self._stop = rasterizer, num_frames, stop
         self.configure(config)
 
@@ -140,11 +144,30 @@ class Mapper:
             self.keyframes.append(frame.keyframe.bare(), frame.to_fit)
         return self.keyframes.window([]) if chosen is None else self.keyframes.window(chosen, frame)
 
-    def optimize(self, window: Window, plan: MappingPlan) -> None:
-        """Fits the map to the window, one random view a step, and prunes."""
+    def optimize(self, window: Window, plan: MappingPlan, pressure: PressureGauge = no_pressure) -> int:
+        """Fits the map to the window, one random view a step, and prunes.
+
+        Args:
+            window: the views.
+            plan: says how many steps.
+            pressure: asked before each step; while something waits, most steps are postponed until ``catch_up``.
+
+        Returns:
+            The number of steps that were postponed.
+        """
+        self._last_window = window
         if plan.steps is None or not window:
-            return
-        views = views_to_fit(window, range(plan.first_step, plan.first_step + plan.steps), self._config, self.rng)
+            return 0
+        self._fit(window, self.backlog.due(range(plan.first_step, plan.first_step + plan.steps), pressure))
+        return self.backlog.postponed
+
+    def catch_up(self, pressure: PressureGauge) -> None:
+        """Takes the steps that were postponed, on the views of the last frame, until something waits."""
+        if self.backlog.owed and self._last_window and pressure() is Pressure.NONE:
+            self._fit(self._last_window, self.backlog.overdue(pressure))
+
+    def _fit(self, window: Window, steps: Iterable[int]) -> None:
+        views = views_to_fit(window, steps, self._config, self.rng)
         self._optimizer.fit(self.map, takewhile(lambda _: not self._stop(), views), self.scene_radius)
 
     def retract(self, first: int) -> int:
@@ -152,6 +175,7 @@ class Mapper:
 
         What those frames have moved stays where it is; the steps that follow, on other views, move it back.
         """
+        self._last_window = self.keyframes.window([])
         added_before = self.map.added_by < first
         self.keyframes.drop_from(first)
         removed = len(added_before) - int(added_before.sum())
@@ -165,6 +189,7 @@ class Mapper:
         Args:
             motion_of: returns the motions [K, 4, 4] in the world of frames [K].
         """
+        self._last_window = self.keyframes.window([])  # its views are where they were
         self.map.move(motion_of)
         frames = np.array([keyframe.frame for keyframe in self.keyframes], dtype=np.int64)
         T_cam_world = [keyframe.T_cam_world.double().numpy(force=True) for keyframe in self.keyframes]

@@ -29,9 +29,10 @@ from splatam_core.rasterizer import Gaussians, Rasterizer, Render
 from splatam_core.rasterizer.native import make_native_aligner
 from splatam_core.tracking.aligner import Aligner
 from splatam_core.tracking.base import TrackingResult
-from splatam_core.tracking.features import pose_by_features
+from splatam_core.tracking.features import features_of, pose_by_features
 from splatam_core.tracking.gauss_newton import GaussNewton
 from splatam_core.tracking.motion import SeenMotion
+from splatam_core.tracking.newest import OfNewestViews
 from splatam_core.tracking.pace import Pace
 from splatam_core.tracking.pyramid import Level, frame_level, full_pyramid, half_pyramid, render_level
 from splatam_core.tracking.time_offset import TimeOffset
@@ -75,6 +76,8 @@ class AlignmentTracker:
         self._gauss_newton = GaussNewton(self._aligner, config)
         # Colour is as late in one frame as in the next, so that both images move alike.
         self._between_frames = GaussNewton(self._aligner, replace(config, align=replace(config.align, time_offset=False)))
+        self._pyramids = OfNewestViews(lambda view: half_pyramid(frame_level(view, self._aligner), self._aligner))
+        self._features = OfNewestViews(features_of)
 
     def track(
         self,
@@ -86,8 +89,7 @@ class AlignmentTracker:
         pace: Pace | None = None,
     ) -> TrackingResult:
         """See ``Tracker.track``."""
-        pyramid = half_pyramid(frame_level(view, self._aligner), self._aligner)
-        frame = _Frame(view, pyramid, gaussians, T_cam_world_before, time_offset or TimeOffset(), pace or Pace())
+        frame = _Frame(view, self._pyramids.of(view), gaussians, T_cam_world_before, time_offset or TimeOffset(), pace or Pace())
         found = self._align_twice(frame, T_cam_world)
         if not self._config.align.features or (self._is_good(found) and not _is_far(found, T_cam_world)):
             return found
@@ -101,7 +103,7 @@ class AlignmentTracker:
         """See ``Tracker.motion``."""
         if torch.equal(view.rgb8, before.rgb8):
             return None  # the same picture sent twice is no sign of rest
-        references, frames = (half_pyramid(frame_level(image, self._aligner), self._aligner) for image in (before, view))
+        references, frames = self._pyramids.of(before), self._pyramids.of(view)
         found = self._between_frames.align(references, frames, None, TimeOffset(), T_now_before)
         evidence = found.evidence
         if evidence.explained < self._config.min_explained_fraction:
@@ -147,7 +149,7 @@ class AlignmentTracker:
     def _pose_by_features(self, frame: _Frame, T_cam_world: Matrix) -> Matrix | None:
         """Returns the frame's pose by its features in common with the map at a pose; None if there are too few."""
         render = self._render(frame.gaussians, frame.view.camera, T_cam_world)
-        motion = pose_by_features(render, frame.view)
+        motion = pose_by_features(render, frame.view.camera, self._features.of(frame.view))
         return None if motion is None else motion @ T_cam_world
 
     def _render(self, gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Matrix) -> Render:

@@ -66,8 +66,9 @@ class TfTopics:
             self._static = node.create_publisher(message, '/tf_static', PUBLISH_STATIC_QOS)
 
     def publish(self, stamp_ns: int, transforms: Mapping[tuple[str, str], Matrix]) -> None:
-        """Publish ``T_parent_child`` of each (parent, child) on ``/tf``."""
-        self._publish(self._moving, stamp_ns, transforms)
+        """Publish ``T_parent_child`` of each (parent, child) on ``/tf``, if someone subscribes."""
+        if self._moving is not None and self._moving.get_subscription_count() > 0:
+            self._publish(self._moving, stamp_ns, transforms)
 
     def publish_static(self, stamp_ns: int, transforms: Mapping[tuple[str, str], Matrix]) -> None:
         """Publish ``T_parent_child`` of each (parent, child) on ``/tf_static``, if the set of links has changed."""

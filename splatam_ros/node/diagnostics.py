@@ -60,6 +60,7 @@ class Sample:
         camera_frame: coordinate frame of the camera; empty before the first frame.
         relocalised: number of times that a lost camera was found anew in the map.
         graph: what the keyframe graph holds.
+        shortened: number of frames that took fewer optimization steps than usual, because others waited.
     """
 
     monotonic_s: float
@@ -77,6 +78,7 @@ class Sample:
     camera_frame: str
     relocalised: int = 0
     graph: GraphSummary = GraphSummary()
+    shortened: int = 0
 
 
 class FrameCounters:
@@ -86,6 +88,7 @@ class FrameCounters:
         by_status: number of processed frames by status.
         refused: number of frames that SLAM could not use.
         relocalised: number of times that a lost camera was found anew in the map.
+        shortened: number of frames that postponed optimization steps.
         failed: number of frames for which SLAM or publishing failed.
         newest: result of the newest frame; None before the first.
         delay_s: time from the newest pose's stamp to its publication; None before the first pose.
@@ -95,7 +98,7 @@ class FrameCounters:
 
     def __init__(self) -> None:
         self.by_status = dict.fromkeys(Status, 0)
-        self.refused = self.failed = self.relocalised = 0
+        self.refused = self.failed = self.relocalised = self.shortened = 0
         self.newest: FrameResult | None = None
         self.delay_s: float | None = None
         self.frame_id = ''
@@ -122,6 +125,7 @@ class FrameCounters:
         """Count a processed frame."""
         self.by_status[result.status] += 1
         self.relocalised += result.is_relocalised
+        self.shortened += result.postponed_steps > 0
         self.newest, self.graph = result, graph or GraphSummary()
         self.frame_id = frame_id
 
@@ -234,6 +238,7 @@ def processing_report(before: Sample, now: Sample) -> Report:
         'frames waiting': str(now.waiting_frames),
         'frames dropped': str(now.dropped_frames),
         'frames refused': str(now.refused_frames),
+        'frames that shortened mapping': str(now.shortened),
     }
     if now.result is not None:
         timings = now.result.timings

@@ -176,6 +176,7 @@ class SplatamNode(Node):
             camera_frame=self._frames.camera_frame(self._counters.frame_id),
             relocalised=self._counters.relocalised,
             graph=self._counters.graph,
+            shortened=self._counters.shortened,
         )
 
     def _use_options(self, options: NodeOptions) -> None:

@@ -70,12 +70,14 @@ def _pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.round(127 + 60 * np.sin(8 * x) + 60 * np.cos(9 * y)).astype(np.uint8)
 
 
-def test_readings_that_are_none_become_zero() -> None:
+@pytest.mark.parametrize('none', [np.nan, np.inf, -np.inf, -1.0, 0.0])
+def test_readings_that_are_none_become_zero(none: float) -> None:
     depth = np.full((48, 64), 2.0, np.float32)
-    depth[0, :4] = [np.nan, np.inf, -1.0, 0.0]
+    depth[0, :4] = none
     frame = FrameFactory(CameraCalibration(CAMERA)).make(1, np.zeros((48, 64, 3), np.uint8), depth)
     assert not frame.depth_m[0, :4].any()
     assert (frame.depth_m[1:] == 2.0).all()
+    assert (frame.depth_m is depth) == (none == 0)  # copied only where something changes
 
 
 def test_wrong_sizes_are_named() -> None:

@@ -14,7 +14,7 @@ from splatam_core.graph.places import Places
 from splatam_core.images.view import View
 from splatam_core.mapping.posed import PosedView
 from splatam_core.rasterizer import Render
-from splatam_core.tracking.features import pose_by_features
+from splatam_core.tracking.features import features_of, pose_by_features
 
 KEYFRAMES = range(0, 300, 30)
 
@@ -115,4 +115,4 @@ def test_images_too_small_for_a_feature_have_none(places: Places, size: tuple[in
     assert len(few) == 1 and len(few.arrays()['points']) == 0
     flat = torch.ones(height, width)
     render = Render(rgb.permute(2, 0, 1) / 255, flat, flat)
-    assert pose_by_features(render, view) is None
+    assert pose_by_features(render, view.camera, features_of(view)) is None

@@ -24,7 +24,7 @@ from splatam_core.rasterizer import Gaussians, Render, make_rasterizer
 from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.slam import Slam
 from splatam_core.tracking import make_tracker
-from splatam_core.tracking.features import pose_by_features
+from splatam_core.tracking.features import features_of, pose_by_features
 from splatam_core.tracking.motion import MotionModel
 from splatam_core.tracking.time_offset import TimeOffset
 from splatam_core.tracking.verdict import verify
@@ -162,10 +162,13 @@ def test_features_tell_a_pose_or_nothing(leap: tuple[RgbdFrame, RgbdFrame, np.nd
     with torch.no_grad():
         render = make_rasterizer('cpu', 1).render(slam.map.gaussians, view.camera, torch.eye(4))
         nothing = make_rasterizer('cpu', 1).render(slam.map.gaussians, view.camera, torch.diag(torch.tensor([-1.0, 1, -1, 1])))
-    found = pose_by_features(render, view)
+    found = pose_by_features(render, view.camera, features_of(view))
     assert np.linalg.norm((found @ leap[2])[:3, 3]) < 0.1  # 1 to 7 cm, from second frame to second frame
     blank = dataclasses.replace(view, rgb8=torch.full_like(view.rgb8, 99))
-    assert pose_by_features(render, blank) is None and pose_by_features(nothing, view) is None
+    assert (
+        pose_by_features(render, blank.camera, features_of(blank)) is None
+        and pose_by_features(nothing, view.camera, features_of(view)) is None
+    )
 
 
 def test_a_view_of_somewhere_else_is_lost(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:

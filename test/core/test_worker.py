@@ -9,6 +9,7 @@ import pytest
 
 from splatam_core.errors import FrameError
 from splatam_core.geometry.camera import PinholeCamera
+from splatam_core.interruption import Pressure, PressureGauge
 from splatam_core.types import FrameResult, RgbdFrame, StageTimings, Status
 from splatam_core.worker import SlamWorker, WorkerStopped
 
@@ -27,6 +28,8 @@ class HeldSlam:
         self.gate = threading.Semaphore(0 if held else 10_000)
         self.started = threading.Semaphore(0)
         self.threads: set[threading.Thread] = set()
+        self.pressures: list[Pressure] = []
+        self.caught_up: list[Pressure] = []
 
     def release(self, frames: int) -> None:
         self.gate.release(frames)
@@ -34,17 +37,22 @@ class HeldSlam:
     def wait_started(self) -> None:
         assert self.started.acquire(timeout=TIMEOUT_S)
 
-    def process(self, frame: RgbdFrame) -> FrameResult:
+    def process(self, frame: RgbdFrame, pressure: PressureGauge) -> FrameResult:
         self.threads.add(threading.current_thread())
         self.started.release()
         assert self.gate.acquire(timeout=TIMEOUT_S)
+        self.pressures.append(pressure())
         if frame.stamp_ns == 13:
             raise FrameError('unlucky')
         if frame.stamp_ns == 98:
             raise ZeroDivisionError('broken')
         if frame.stamp_ns == 99:
             raise SystemExit('ended')
-        return FrameResult(0, frame.stamp_ns, Status.TRACKED, np.eye(4), False, 0, 1.0, 1.0, '', StageTimings())
+        status = Status.LOST if frame.stamp_ns == 77 else Status.TRACKED
+        return FrameResult(0, frame.stamp_ns, status, np.eye(4), False, 0, 1.0, 1.0, '', StageTimings())
+
+    def catch_up(self, pressure: PressureGauge) -> None:
+        self.caught_up.append(pressure())
 
 
 class Recorder:
@@ -106,6 +114,41 @@ def test_drop_oldest_keeps_the_newest_and_counts() -> None:
     slam.release(3)
     worker.stop(drain=True)
     assert recorder.results == [1, 4, 5]
+
+
+@pytest.mark.parametrize(
+    ('when_full', 'queue_size', 'expected'),
+    [
+        ('drop_oldest', 2, [Pressure.FULL, Pressure.WAITING, Pressure.NONE]),
+        ('drop_oldest', 3, [Pressure.WAITING, Pressure.WAITING, Pressure.NONE]),
+        ('block', 2, [Pressure.NONE, Pressure.NONE, Pressure.NONE]),
+    ],
+)
+def test_a_live_camera_presses_and_a_recording_never(when_full: str, queue_size: int, expected: list[Pressure]) -> None:
+    slam = HeldSlam()
+    worker, recorder = start(slam, queue_size=queue_size, when_full=when_full)
+    worker.submit(frame(1))
+    slam.wait_started()
+    worker.submit(frame(2))
+    worker.submit(frame(3))
+    slam.release(3)
+    while worker.pending:
+        threading.Event().wait(0.001)
+    assert slam.pressures == slam.caught_up == expected
+    worker.stop(drain=True)
+    assert recorder.results == [1, 2, 3]
+
+
+def test_a_call_presses_and_a_frame_that_is_lost_catches_up_with_nothing() -> None:
+    slam = HeldSlam()
+    worker, _ = start(slam, when_full='drop_oldest')
+    worker.submit(frame(77))
+    slam.wait_started()
+    called = worker.call(lambda owned: None)
+    slam.release(1)
+    called.result(TIMEOUT_S)
+    assert slam.pressures == [Pressure.WAITING] and not slam.caught_up
+    worker.stop(drain=True)
 
 
 def test_block_waits_for_room_and_loses_nothing() -> None:

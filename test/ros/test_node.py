@@ -170,11 +170,11 @@ import sys, time
 from pathlib import Path
 from splatam_core.slam import Slam
 works = Slam.process
-def process(self, frame):
+def process(self, *args):
     print('at work', flush=True)
     while not Path(sys.argv[1]).exists():
         time.sleep(0.01)
-    return works(self, frame)
+    return works(self, *args)
 Slam.process = process
 from splatam_ros.node.main import main
 sys.exit(main(sys.argv[2:]))
@@ -307,12 +307,12 @@ BREAKS = """
 import sys
 from splatam_core.slam import Slam
 works, count = Slam.process, 0
-def process(self, frame):
+def process(self, *args):
     global count
     count += 1
     if count == 4:
         raise ZeroDivisionError('something nobody thought of')
-    return works(self, frame)
+    return works(self, *args)
 Slam.process = process
 from splatam_ros.node.main import main
 sys.exit(main(sys.argv[1:]))
@@ -347,9 +347,9 @@ SLOW = """
 import sys, time
 from splatam_core.slam import Slam
 works = Slam.process
-def process(self, frame):
+def process(self, *args):
     time.sleep(0.4)
-    return works(self, frame)
+    return works(self, *args)
 Slam.process = process
 from splatam_ros.node.main import main
 sys.exit(main(sys.argv[1:]))

@@ -33,10 +33,10 @@ from splatam_core.config import load_config
 from splatam_core.datasets.synthetic import SyntheticSequence
 from splatam_core.resources import config_dir
 from splatam_core.slam import Slam
-from splatam_core.types import MapSnapshot, RenderedView, RgbdFrame, Status
+from splatam_core.types import FrameResult, MapSnapshot, RenderedView, RgbdFrame, StageTimings, Status
 from splatam_ros import interface
 from splatam_ros.frames.robot_frames import RobotFrames
-from splatam_ros.node.diagnostics import PERIOD_S, InputSample, Sample, reports
+from splatam_ros.node.diagnostics import PERIOD_S, FrameCounters, InputSample, Sample, reports
 from splatam_ros.node.outputs import OUTPUTS, Outputs
 from splatam_ros.node.parameters import NODE_SETTINGS, node_options
 from splatam_ros.throttled_warnings import ThrottledWarnings
@@ -185,7 +185,7 @@ def test_diagnostics_say_what_comes_and_goes(graph: Graph, frames: SyntheticSequ
         assert values('input', f'{topic} publishers') == '1'
     assert 0.5 < float(values('processing', 'pose delay (s)')) < time.monotonic() - started_s + 0.5
     assert 0 < float(values('processing', 'track (ms)')) < float(values('processing', 'total (ms)'))
-    assert {'frames waiting', 'frames dropped', 'frames refused', 'densify (ms)', 'map (ms)'} <= (
+    assert {'frames waiting', 'frames dropped', 'frames refused', 'frames that shortened mapping', 'map (ms)'} <= (
         diagnostics.values('processing').keys()
     )
     assert int(values('map', 'Gaussians')) > 1000
@@ -230,6 +230,15 @@ def test_rates_are_of_the_time_between_two_samples() -> None:
     values = {key: value for report in found for key, value in report.values.items()}
     assert values['/rgb/image rate (Hz)'] == '30.0'
     assert (values['frame rate (Hz)'], values['pose rate (Hz)']) == ('3.5', '3.0')
+
+
+def test_frames_that_shorten_mapping_are_counted() -> None:
+    counters = FrameCounters()
+    for postponed in (0, 2, 0, 3):
+        result = FrameResult(0, 1, Status.TRACKED, np.eye(4), False, 9, 1.0, 1.0, '', StageTimings(), postponed_steps=postponed)
+        counters.add(result, 'camera')
+    (report,) = [item for item in reports(sample(0), sample(2, shortened=counters.shortened)) if item.name == 'processing']
+    assert (report.level, report.values['frames that shortened mapping']) == (OK, '2')
 
 
 def test_the_map_is_there_for_whoever_comes_after_the_last_frame(graph: Graph, frames: SyntheticSequence) -> None:
@@ -280,6 +289,8 @@ def test_what_costs_is_made_for_listeners_only_and_at_its_rate(
 ) -> None:
     clock = ManualClock()
     monkeypatch.setattr('splatam_ros.node.outputs.time', clock)
+    for nobody_listens in ('odometry', 'pose_with_covariance'):
+        monkeypatch.delattr(f'splatam_ros.node.outputs.poses.{nobody_listens}')
     options = node_options({'publish_tf': False, 'publish_rate.render': 4.0, 'publish_rate.cloud': 2.0})
     warnings = ThrottledWarnings(graph.node.get_logger())
     robot_frames = RobotFrames(graph.node, options.frames, warnings, reliability='auto', keep_all=False)
