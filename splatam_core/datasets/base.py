@@ -228,7 +228,9 @@ def nominal_stamp_ns(frame: int, rate_hz: int = NOMINAL_RATE_HZ) -> int:
 
 def metres(counts: NDArray[np.uint16], depth_scale: float) -> NDArray[np.float32]:
     """Convert depth counts to float32 metres; 0 stays 0."""
-    return counts.astype(np.float32) / np.float32(depth_scale)
+    depth_m = counts.astype(np.float32)
+    depth_m /= np.float32(depth_scale)
+    return depth_m
 
 
 def check_increasing(stamps_ns: NDArray[np.int64], name: str) -> None:

@@ -65,7 +65,7 @@ def read_color(path: Path) -> NDArray[np.uint8]:
         DatasetError: the file is missing or not an image.
     """
     image = _read_image(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB, image), np.uint8)  # in place
 
 
 def read_depth_counts(path: Path) -> NDArray[np.uint16]:

@@ -131,7 +131,8 @@ class ImagePairs:
         try:
             if pair.depth is None:
                 raise DatasetError(f'{pair.color}: there is no depth image for it')
-            rgb, depth_m = files.read_color(pair.color), self._depth.read(pair.depth)
+            depth_m = self._depth.read(pair.depth)  # first, because it is larger: colour then finds less to break up
+            rgb = files.read_color(pair.color)
         except DatasetError as error:
             raise FrameError(str(error)) from None
         return factory.make(pair.stamp_ns, rgb, depth_m)

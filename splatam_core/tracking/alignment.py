@@ -142,9 +142,13 @@ class AlignmentTracker:
         renders_half = 0 < self._config.align.half_render_from <= camera.width and finest != camera
         if renders_half:
             camera = finest
-        render = self._render(frame.gaussians, camera, T_cam_world)
-        level = render_level(render, camera, self._config.silhouette_threshold, self._aligner)
+        level = self._rendered(frame.gaussians, camera, T_cam_world)
         return full_pyramid(level, self._aligner) if renders_half else half_pyramid(level, self._aligner)
+
+    def _rendered(self, gaussians: Gaussians, camera: PinholeCamera, T_cam_world: Matrix) -> Level:
+        """Returns the map rendered at a pose; the images of the render go."""
+        render = self._render(gaussians, camera, T_cam_world)
+        return render_level(render, camera, self._config.silhouette_threshold, self._aligner)
 
     def _pose_by_features(self, frame: _Frame, T_cam_world: Matrix) -> Matrix | None:
         """Returns the frame's pose by its features in common with the map at a pose; None if there are too few."""

@@ -76,9 +76,14 @@ def full_pyramid(level: Level, aligner: Aligner[Any]) -> list[Level]:
 
     A render blends the depths on both sides of an edge. ``half_pyramid`` removes them when it halves the first time.
     """
-    depth = aligner.layers(level.brightness, level.depth, EDGE)[..., _DEPTH_LAYER]
-    finest = replace(level, depth=depth if isinstance(depth, Tensor) else np.ascontiguousarray(depth))
+    finest = replace(level, depth=_without_edges(level, aligner))
     return [finest, *_halved(finest, aligner)]
+
+
+def _without_edges(level: Level, aligner: Aligner[Any]) -> Array | Tensor:
+    """Returns a level's depth without depth edges; the other layers, eight times as much memory, go."""
+    depth = aligner.layers(level.brightness, level.depth, EDGE)[..., _DEPTH_LAYER]
+    return depth.contiguous() if isinstance(depth, Tensor) else np.ascontiguousarray(depth)
 
 
 def _halved(level: Level, aligner: Aligner[Any]) -> Iterator[Level]:
