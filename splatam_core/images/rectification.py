@@ -98,7 +98,7 @@ class FrameFactory:
         Raises:
             FrameError: colour does not have the size of the calibration, or depth not its aspect ratio or camera's size.
         """
-        pinhole, given = self.calibration.pinhole, depth_m
+        pinhole = self.calibration.pinhole
         if rgb.shape[:2] != (pinhole.height, pinhole.width):
             raise FrameError(
                 f'colour image is {_size(rgb)} but the camera is calibrated for {pinhole.width}x{pinhole.height}; '
@@ -121,8 +121,7 @@ class FrameFactory:
                 depth_m = _resized(depth_m, size, cv2.INTER_NEAREST_EXACT)
             else:
                 depth_m = shrunk_readings(_clean(depth_m), *size)
-        depth_m = _clean(depth_m) if depth_m is given else _cleaned(depth_m)
-        return RgbdFrame(stamp_ns, np.ascontiguousarray(rgb), depth_m, self.camera, depth_spacing=spacing)
+        return RgbdFrame(stamp_ns, np.ascontiguousarray(rgb), _clean(depth_m), self.camera, depth_spacing=spacing)
 
     def _at_colour_size(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
         width, height = self.calibration.pinhole.width, self.calibration.pinhole.height
@@ -189,12 +188,6 @@ def _clean(depth_m: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
     if depth_m.dtype == np.float32 and depth_m.flags.carray and depth_m.min() >= 0 and depth_m.max() < np.inf:  # false for NaN
         return np.asarray(depth_m, np.float32)
     return kept(depth_m, (depth_m > 0) & (depth_m < np.inf))
-
-
-def _cleaned(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Returns the same array [H, W], in which 0 has been written where there is no reading."""
-    np.copyto(depth_m, 0, where=~((depth_m > 0) & (depth_m < np.inf)))
-    return depth_m
 
 
 def _resized(image: NDArray[Value], size: tuple[int, int], interpolation: int) -> NDArray[Value]:
