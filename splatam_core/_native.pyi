@@ -174,6 +174,9 @@ def solve_blocks(place: NDArray[np.int32], blocks: Doubles, right_hand_side: Dou
     matrix that is not positive definite is a ValueError.
     """
 
+def match(ours: Bytes, others: Bytes) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Returns for each descriptor [N, 32] its mutually nearest one of the others [M, 32], and in how many bits; or -1 and -1."""
+
 class TileLists:
     """What ``Blender.forward`` stores for ``Blender.backward``."""
 

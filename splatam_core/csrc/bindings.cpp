@@ -12,6 +12,7 @@
 #include "block_cholesky.hpp"
 #include "descent.hpp"
 #include "engine.hpp"
+#include "matcher_bindings.hpp"
 #include "weigh.hpp"
 
 namespace py = pybind11;
@@ -518,5 +519,6 @@ PYBIND11_MODULE(_native, module) {
   bind_engine(module);
   bind_aligner(module);
   bind_blender(module);
+  bind_matcher(module);
   module.def("solve_blocks", &solve_in_place, py::arg("place"), py::arg("blocks"), py::arg("right_hand_side"));
 }

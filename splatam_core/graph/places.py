@@ -24,6 +24,7 @@ from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.features import orb_features
 from splatam_core.images.view import View
 from splatam_core.mapping.posed import PosedView
+from splatam_core.tracking.matching import matched
 from splatam_core.types import Arrays
 
 NUM_FEATURES = 600
@@ -244,14 +245,14 @@ class Places:
         keyframe = self._keyframes[number]
         if min(len(seen.descriptors), len(keyframe.descriptors)) < _MIN_INLIERS:
             return None
-        pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(keyframe.descriptors, seen.descriptors)
-        pairs = [pair for pair in pairs if pair.distance <= _FARTHEST]
-        left, right = [pair.queryIdx for pair in pairs], [pair.trainIdx for pair in pairs]
+        pairs = matched(keyframe.descriptors, seen.descriptors)
+        is_near = pairs.distance <= _FARTHEST
+        left, right = pairs.first[is_near], pairs.second[is_near]
         points, seen_points = keyframe.points[left].astype(np.float64), seen.points[right].astype(np.float64)
         matches = _Matches(points, seen_points, seen.pixels[right], seen.camera)
         T, inliers = matches.pose()
         num_inliers = int(inliers.sum())
-        return None if num_inliers < _MIN_INLIERS else Place(number, T, T @ keyframe.T_cam_world, len(pairs), num_inliers)
+        return None if num_inliers < _MIN_INLIERS else Place(number, T, T @ keyframe.T_cam_world, len(left), num_inliers)
 
 
 def shows_a_place(view: View) -> bool:

@@ -53,6 +53,27 @@ def solve_blocks(place: NDArray[np.int32], blocks: NDArray[np.float64], right_ha
     _extension().solve_blocks(place, blocks, right_hand_side)
 
 
+def has_extension() -> bool:
+    """True unless the extension is missing, as on a machine that computes on a GPU alone."""
+    try:
+        _extension()
+    except RasterizerError:
+        return False
+    return True
+
+
+def match_descriptors(ours: NDArray[np.uint8], others: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Returns for each descriptor [N, 32] which of the others [M, 32] is mutually nearest, and in how many bits they differ.
+
+    Both are -1 where there is none.
+
+    Raises:
+        RasterizerError: the extension is missing.
+    """
+    partners, distances = _extension().match(np.ascontiguousarray(ours), np.ascontiguousarray(others))
+    return partners, distances
+
+
 @contextmanager
 def native_errors() -> Iterator[None]:
     """Turns what the native code refuses, because a view is too large, into one line.

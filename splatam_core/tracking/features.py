@@ -19,6 +19,7 @@ from splatam_core.geometry.se3 import Matrix
 from splatam_core.images.features import orb_features
 from splatam_core.images.view import View
 from splatam_core.rasterizer import Render
+from splatam_core.tracking.matching import matched
 
 _NUM_FEATURES = 1000
 _FAST_THRESHOLD = 7  # of 255; the default, 20, finds little in a blurred frame
@@ -69,9 +70,9 @@ def _matches(render: Render, camera: PinholeCamera, of_frame: Features) -> tuple
     frame_keypoints, frame_descriptors = of_frame
     if render_descriptors is None or frame_descriptors is None:
         return np.empty((0, 3)), np.empty((0, 2))
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(render_descriptors, frame_descriptors)
-    in_render = np.array([render_keypoints[pair.queryIdx].pt for pair in pairs]).reshape(-1, 2)
-    in_frame = np.array([frame_keypoints[pair.trainIdx].pt for pair in pairs]).reshape(-1, 2)
+    pairs = matched(render_descriptors, frame_descriptors)
+    in_render = np.array([render_keypoints[index].pt for index in pairs.first]).reshape(-1, 2)
+    in_frame = np.array([frame_keypoints[index].pt for index in pairs.second]).reshape(-1, 2)
     u, v = in_render.round().astype(int).T
     silhouette = render.silhouette.numpy(force=True)[v, u]
     is_opaque = silhouette > _MIN_SILHOUETTE
