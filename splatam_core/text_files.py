@@ -24,6 +24,9 @@ MAX_YAML_BYTES = 64 * 2**10
 """Settings and cameras take a few kilobytes, and the YAML library is slow."""
 
 MAX_YAML_DEPTH = 50
+LEAST_READ = 2**20
+"""Bytes; files of the kernel state no size."""
+
 WAYS_TO_FAIL = (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RecursionError, yaml.YAMLError)
 """What the YAML library raises for invalid dates, numbers without digits, unknown truth values, and so on."""
 
@@ -47,7 +50,8 @@ def read_bytes(path: Path, error: type[SplatamError], at_most: int, beginning: i
                 raise error(f'{path}: cannot be read: it is no regular file')
             if status.st_size > at_most:
                 raise error(f'{path}: cannot be read: it has {status.st_size} bytes, and at most {at_most} are read')
-            return file.read(at_most if beginning is None else beginning)
+            wanted = at_most if beginning is None else beginning
+            return file.read(min(wanted, max(status.st_size, LEAST_READ)))  # which allocates as much
     except OSError as fault:
         raise error(f'{path}: cannot be read: {fault.strerror}') from None
     except ValueError:  # a NUL or half of a surrogate pair in the name

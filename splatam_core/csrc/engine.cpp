@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstring>
 #include <limits>
+#include <memory>
 #include <numeric>
 #include <string>
 #include <utility>
@@ -57,8 +58,13 @@ void visit_rows(const TileRect& rect, Visit&& visit) {
   }
 }
 
+// Makes room for `count` values; those that were there may go.
 template <typename T>
 void grow(std::vector<T>& values, std::size_t count) {
+  if (values.capacity() < count) {  // not at once with the old ones, nor twice as many
+    std::vector<T>().swap(values);
+    values.reserve(count + count / 4);
+  }
   if (values.size() < count) values.resize(count);
 }
 
@@ -297,26 +303,41 @@ void Engine::project_block(View& view, std::size_t block, const GaussianArrays& 
 
 namespace {
 
+// The gradients of the members take the place of the splats, which have become members.
+static_assert(sizeof(SplatGradient) == sizeof(Splat) && alignof(SplatGradient) == alignof(Splat));
+
+void make_room_for_gradients(View& view) { grow(view.splats, view.member_begins.back()); }
+
+SplatGradient* gradients_of(View& view) { return reinterpret_cast<SplatGradient*>(view.splats.data()); }
+
 // Clears the gradients of a row's members and returns them.
 SplatGradient* cleared_gradients(View& view, int row) {
-  SplatGradient* gradients = view.gradients.data() + view.member_begins[row];
-  std::fill_n(gradients, view.num_members(row), SplatGradient{});
+  SplatGradient* gradients = gradients_of(view) + view.member_begins[row];
+  std::uninitialized_fill_n(gradients, view.num_members(row), SplatGradient{});
   return gradients;
 }
 
-using BlockGradients = std::array<SplatGradient, kBlock>;
+// The splats of a block, and their gradients.
+struct BlockSums {
+  std::array<Splat, kBlock> splats;
+  std::array<SplatGradient, kBlock> gradients;
+};
 
 // Sums the gradients of a block's splats over the rows.
-void sum_gradients(const View& view, std::size_t block, BlockGradients& sums) {
+void sum_gradients(View& view, std::size_t block, BlockSums& sums) {
+  const SplatGradient* gradients = gradients_of(view);
   RowPlaces next(view, block);
   for (std::size_t i = 0; i < view.block_sizes[block]; ++i) {
     SplatGradient sum{};
+    std::size_t member = 0;
     visit_rows(view.rects[block * kBlock + i], [&](int row, Columns) {
-      const SplatGradient& g = view.gradients[next.take(row)];
+      member = next.take(row);
+      const SplatGradient& g = gradients[member];
       sum.log_alpha += g.log_alpha, sum.dx += g.dx, sum.dy += g.dy, sum.squared += g.squared;
       sum.r += g.r, sum.g += g.g, sum.b += g.b, sum.z += g.z;
     });
-    sums[i] = sum;
+    sums.splats[i] = view.members[member];
+    sums.gradients[i] = sum;
   }
 }
 
@@ -326,7 +347,7 @@ void Engine::backward(View& view, const GaussianArrays& gaussians, const ConstIm
                       const ConstImages& gradient, const MapGradients& map, float pose_gradient[12]) {
   std::lock_guard<std::mutex> lock(mutex_);
   const bool any_map = map.means || map.log_scales || map.logit_opacities || map.rgb;
-  grow(view.gradients, view.member_begins.back());
+  make_room_for_gradients(view);
   for_rows(view, [&](int row, Scratch&) {
     SplatGradient* gradients = cleared_gradients(view, row);
     for_tiles(view, row, [&](const TileList& tile, const Splat* members) {
@@ -335,9 +356,9 @@ void Engine::backward(View& view, const GaussianArrays& gaussians, const ConstIm
   });
   std::vector<std::array<double, 12>> pose_sums(view.num_blocks);
   for_blocks(view, [&](std::size_t block) {
-    BlockGradients sums;
+    BlockSums sums;
     sum_gradients(view, block, sums);
-    kernels_.project_back(view.splats.data() + block * kBlock, view.ids.data() + block * kBlock, sums.data(),
+    kernels_.project_back(sums.splats.data(), view.ids.data() + block * kBlock, sums.gradients.data(),
                           view.block_sizes[block], view.camera, view.pose, gaussians.means, map,
                           pose_sums[block].data());
   });
@@ -361,7 +382,7 @@ double Engine::fit(const MutableGaussians& gaussians, std::size_t count, float* 
   std::lock_guard<std::mutex> lock(mutex_);
   const GaussianArrays now{gaussians.means, gaussians.log_scales, gaussians.logit_opacities, gaussians.rgb};
   auto view = project(now, count, bounds, camera, pose);
-  grow(view->gradients, view->member_begins.back());
+  make_room_for_gradients(*view);
   std::vector<double> losses(view->tiles_y, 0.0);
   for_rows(*view, [&](int row, Scratch& scratch) {
     list_tiles(*view, row, scratch.keys, scratch.sorted);
@@ -374,9 +395,9 @@ double Engine::fit(const MutableGaussians& gaussians, std::size_t count, float* 
   });
   for_blocks(*view, [&](std::size_t block) {
     if (view->block_sizes[block] == 0) return;
-    BlockGradients sums;
+    BlockSums sums;
     sum_gradients(*view, block, sums);
-    kernels_.update(view->splats.data() + block * kBlock, view->ids.data() + block * kBlock, sums.data(),
+    kernels_.update(sums.splats.data(), view->ids.data() + block * kBlock, sums.gradients.data(),
                     view->block_sizes[block], camera, pose, gaussians, adam, rates,
                     bounds ? bounds + kBounds * block : nullptr);
   });

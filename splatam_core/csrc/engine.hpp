@@ -32,7 +32,8 @@ struct Columns {
 
 // What a forward pass stores for its backward pass. Projected Gaussians (splats) are stored in blocks of kBlock, with
 // gaps. Each row of tiles has copies (members) of the splats that touch it, in the order of the map, and its own sums
-// of their gradients, which are then added row by row. So neither sums nor memory depend on the number of threads.
+// of their gradients, which are then added row by row. So neither sums nor memory depend on the number of threads. The
+// gradients take the place of the splats.
 // Vectors are as long as the largest view needed, so that they are not cleared again and again.
 struct View {
   Camera camera;
@@ -40,7 +41,7 @@ struct View {
   std::size_t num_gaussians = 0, num_blocks = 0;
   int tiles_x = 0, tiles_y = 0;
 
-  std::vector<Splat> splats;
+  std::vector<Splat> splats;  // until they are members; then gradients
   std::vector<TileRect> rects;
   std::vector<std::uint32_t> ids;        // splat -> Gaussian
   std::vector<std::size_t> block_sizes;  // visible Gaussians per block
@@ -50,7 +51,6 @@ struct View {
   std::vector<std::size_t> member_begins;  // rows + 1
   std::vector<Splat> members;              // row by row
   std::vector<Columns> columns;            // of the members
-  std::vector<SplatGradient> gradients;    // of the members
 
   std::vector<std::size_t> entry_begins;            // rows + 1
   std::vector<std::size_t> tile_begins, tile_ends;  // of a tile's entries

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tracemalloc
 from pathlib import Path
 
 import cv2
@@ -309,3 +310,21 @@ def test_real_recording_is_the_known_camera(recording):
     folder = recording('tum_fr1_rpy')
     stated = KNOWN_CAMERAS['1']
     assert tum.read(folder).camera == stated.pinhole  # its camera.yaml states what the table states
+
+
+@pytest.mark.parametrize('distortion', ['', 'distortion_model: plumb_bob\ndistortion: [0.1, 0, 0, 0, 0]\n'])
+def test_reading_a_frame_keeps_each_image_twice_at_most(tmp_path: Path, distortion: str) -> None:
+    """Memory that is taken in between is partly lost: frames that wait have their places between what went."""
+    width, height = 640, 480
+    camera = f'width: {width}\nheight: {height}\nfx: 600\nfy: 600\ncx: 320\ncy: 240\n{distortion}'
+    sequence_folder = write_tum(tmp_path / 'sequence', [0, 1], [0, 1], camera=camera)
+    for image in sequence_folder.glob('*/*.png'):
+        cv2.imwrite(str(image), cv2.resize(cv2.imread(str(image), cv2.IMREAD_UNCHANGED), (width, height)))
+    sequence = tum.read(sequence_folder, width=width)
+    assert sequence[0].depth_m.any()  # what is made once
+    tracemalloc.start()
+    frame = sequence[1]
+    kept, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert frame.rgb.nbytes + frame.depth_m.nbytes <= kept < 1.1 * (frame.rgb.nbytes + frame.depth_m.nbytes)
+    assert peak < 17 * width * height  # colour and depth twice are 14 bytes a pixel, and two masks of readings
