@@ -347,8 +347,8 @@ class FusedMappingConfig:
 
     final_passes: int = setting(
         0,
-        'Passes over all keyframes after the last frame, with decreasing step sizes; twice as many if loops corrected the map. '
-        'Increase for a better final map.',
+        'Passes over all keyframes after the last frame, with decreasing step sizes; twice as many if loops corrected the map, up '
+        'to three times as many if there are few keyframes. Increase for a better final map.',
         minimum=0,
         maximum=MAX_STEPS,
     )

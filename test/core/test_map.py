@@ -206,6 +206,7 @@ def _finishing(passes: int, **more: object) -> MappingConfig:
     return load_config(overrides={f'mapping.{name}': value for name, value in values.items()}).mapping
 
 
+@pytest.mark.usefixtures('any_number_of_steps')
 def test_what_fits_is_left_alone_on_the_way_but_not_at_the_end() -> None:
     """The tolerance is an error of colour: ``enough`` is its Huber loss, weighted as colour is."""
     rasterizer, view = _Listed(), PosedView(_view(), EYE)
@@ -213,6 +214,12 @@ def test_what_fits_is_left_alone_on_the_way_but_not_at_the_end() -> None:
     optimizer.fit(gaussian_map := _map(_view()), [view], 1.0)
     optimizer.finish(gaussian_map, [view], np.random.default_rng(0), NO_LIMIT, is_corrected=False)
     assert [target.enough for _, target in rasterizer.asked] == [pytest.approx(2 * 0.02**2 / 0.2), 0.0]
+
+
+@pytest.fixture
+def any_number_of_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many passes as the settings say, however few keyframes there are."""
+    monkeypatch.setattr(fused, 'LEAST_STEPS', 0)
 
 
 def _finish(
@@ -227,12 +234,21 @@ def _finish(
     return make_optimizer(rasterizer, config).finish(_map(_view()), keyframes, rng, limit, is_corrected=is_corrected)
 
 
+@pytest.mark.parametrize(('keyframes', 'passes'), [(1, 12), (25, 6), (30, 5), (38, 4), (80, 4)])
+def test_few_keyframes_are_fitted_more_often_at_the_end(keyframes: int, passes: int) -> None:
+    """At least 150 steps, but at most three times as many passes."""
+    posed, rasterizer = [PosedView(_view(), EYE)] * keyframes, _Listed()
+    assert _finish(posed, rasterizer, _finishing(4), np.random.default_rng(0)) == passes * keyframes
+
+
+@pytest.mark.usefixtures('any_number_of_steps')
 def test_a_map_that_was_corrected_is_fitted_twice_as_often_at_the_end() -> None:
     rasterizer = _Listed()
     assert _finish([PosedView(_view(), EYE)], rasterizer, _finishing(3), np.random.default_rng(0), is_corrected=True) == 6
     assert len(rasterizer.asked) == 6
 
 
+@pytest.mark.usefixtures('any_number_of_steps')
 def test_finishing_fits_every_keyframe_as_often_with_fading_steps() -> None:
     """Each pass has all three, in an order of its own; step sizes fade along half a cosine."""
     keyframes = [PosedView(_view(), _at(0.1 * i)) for i in range(3)]
@@ -254,6 +270,7 @@ def test_views_are_made_smaller_by_scale_and_width(scale: float, max_width: int,
     assert view.camera == _view().camera.resized(width, width * 3 // 4)
 
 
+@pytest.mark.usefixtures('any_number_of_steps')
 def test_finishing_ends_when_its_time_is_up_and_nothing_is_asked_of_it_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fused.time, 'monotonic', itertools.count(step=1e-3).__next__)  # a step takes a millisecond
     keyframe, rng = PosedView(_view(), EYE), np.random.default_rng(0)

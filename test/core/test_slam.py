@@ -19,6 +19,7 @@ from splatam_core.geometry.camera import PinholeCamera
 from splatam_core.images.observation import Observation
 from splatam_core.images.view import View
 from splatam_core.mapping.keyframes import KeyframeStore, draw
+from splatam_core.mapping.optimizers.fused import MOST_TIMES
 from splatam_core.mapping.posed import PosedFrame, PosedView
 from splatam_core.rasterizer import Gaussians, Render, make_rasterizer
 from splatam_core.rasterizer.cpu import CpuRasterizer
@@ -380,7 +381,7 @@ def test_finishing_brings_back_what_the_map_forgot(room: tuple[list[RgbdFrame], 
         return float(np.square(slam.render(poses[index]).rgb.astype(float) - frames[index].rgb).mean())
 
     before = error(0)
-    assert slam.finish() == slam.config.mapping.fused.final_passes * len(frames)
+    assert slam.finish() == MOST_TIMES * slam.config.mapping.fused.final_passes * len(frames)  # there are few
     assert error(0) < 0.8 * before  # 1 dB
 
 

@@ -18,6 +18,10 @@ from splatam_core.rasterizer.base import COLOR_LIMIT
 CORRECTED_PASSES = 2
 """Times as many final passes where loops have moved Gaussians: they were fitted at other poses."""
 
+LEAST_STEPS, MOST_TIMES = 150, 3
+"""Where the final passes have fewer steps, because there are few keyframes, there are up to three times as many passes: a Gaussian
+has its share of the steps, however short the recording is."""
+
 FINAL_FIRST, FINAL_LAST = 5.0, 0.1
 """Step sizes at the beginning and at the end of ``finish``, relative to those of ``fit``; half a cosine lies between them."""
 
@@ -47,9 +51,8 @@ class FusedOptimizer:
         is_corrected: bool,
     ) -> int:  # fmt: skip
         """See ``MapOptimizer.finish``. Decreasing step sizes bring back what few steps a frame had forgotten."""
-        passes = self._config.fused.final_passes * (CORRECTED_PASSES if is_corrected else 1)
         gaussians, moments = gaussian_map.gaussians, gaussian_map.moments
-        num_steps, began_s = passes * len(keyframes), time.monotonic()
+        num_steps, began_s = self._num_passes(len(keyframes), is_corrected) * len(keyframes), time.monotonic()
         for step in range(num_steps):
             if step % len(keyframes) == 0:
                 order = rng.permutation(len(keyframes))
@@ -61,6 +64,11 @@ class FusedOptimizer:
             posed = keyframes[int(order[step % len(keyframes)])]
             self._step(gaussians, moments, posed, _final_rates(self._config, done), tolerance=0.0)
         return num_steps
+
+    def _num_passes(self, num_keyframes: int, is_corrected: bool) -> int:
+        passes = self._config.fused.final_passes * (CORRECTED_PASSES if is_corrected else 1)
+        wanted = math.ceil(LEAST_STEPS / max(1, num_keyframes))
+        return min(max(passes, wanted), MOST_TIMES * passes)
 
     def _step(self, gaussians: Gaussians, moments: Moments, posed: PosedView, rates: Rates, tolerance: float) -> None:
         view, config = posed.view, self._config
