@@ -91,7 +91,7 @@ fuzz-long: setup build/sanitize/.built
 # A second build of the native code, in build/sanitize; test/other_native.py loads it in place of the first.
 SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=undefined -fno-omit-frame-pointer -O1 -g
 SANITIZED_TESTS := test/core/test_native_bindings.py test/core/test_rasterizer_contract.py test/core/test_torch_aligner.py \
-	test/core/test_anisotropic.py test/core/test_finite.py test/core/test_map.py
+	test/core/test_anisotropic.py test/core/test_finite.py test/core/test_map.py test/core/test_matching.py
 define WITH_SANITIZERS
 preload=; for library in asan ubsan stdc++; do preload+="$$(g++ -print-file-name=lib$$library.so) "; done; \
 	export ASAN_OPTIONS=detect_leaks=0:handle_abort=1 UBSAN_OPTIONS=print_stacktrace=1 LD_PRELOAD=$$preload \

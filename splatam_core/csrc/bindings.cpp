@@ -200,7 +200,12 @@ struct Given {
   template <typename T>
   void copy(const char* attribute, T* to, py::ssize_t count) const {
     const py::object array = member(attribute);
-    std::copy_n(values<T>(array, attribute, {count}), count, to);
+    const T* from = values<T>(array, attribute, {count});
+    if constexpr (std::is_same_v<T, bool>)  // numpy takes every byte but 0 for True, C++ only 1
+      std::transform(reinterpret_cast<const unsigned char*>(from), reinterpret_cast<const unsigned char*>(from) + count,
+                     to, [](unsigned char byte) { return byte != 0; });
+    else
+      std::copy_n(from, count, to);
   }
 };
 

@@ -79,6 +79,8 @@ class Mapper:
         self._config, self.keyframes.config = config, config.keyframes
         self.schedule = MappingSchedule(config, self._num_frames)
         self._optimizer = make_optimizer(self._rasterizer, config.mapping)
+        if not (config.mapping.enabled and config.mapping.iterations):
+            self.backlog.forgive()
 
     def still(self, frame: PosedFrame, plan: MappingPlan) -> PosedFrame:
         """Returns a frame in which nothing is compared where something moves into space that was seen to be free."""
@@ -155,14 +157,14 @@ class Mapper:
         Returns:
             The number of steps that were postponed.
         """
-        self._last_window = window
         if plan.steps is None or not window:
             return 0
+        self._last_window = window
         self._fit(window, self.backlog.due(range(plan.first_step, plan.first_step + plan.steps), pressure))
         return self.backlog.postponed
 
     def catch_up(self, pressure: PressureGauge) -> None:
-        """Takes the steps that were postponed, on the views of the last frame, until something waits."""
+        """Takes the steps that were postponed, on the views of the last frame that was mapped, until something waits."""
         if self.backlog.owed and self._last_window and pressure() is Pressure.NONE:
             self._fit(self._last_window, self.backlog.overdue(pressure))
 

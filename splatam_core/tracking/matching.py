@@ -32,6 +32,7 @@ def matched(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> DescriptorPa
         partners, distances = match_descriptors(first, second)
         found = np.flatnonzero(partners >= 0)
         return DescriptorPairs(found, partners[found].astype(np.intp), distances[found])
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(first, second)  # the same in four times the time
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)  # the same in four times the time
+    pairs = matcher.match(first, second) if len(second) else ()  # which OpenCV refuses
     indices = np.array([(pair.queryIdx, pair.trainIdx) for pair in pairs], np.intp).reshape(-1, 2)
     return DescriptorPairs(indices[:, 0], indices[:, 1], np.array([pair.distance for pair in pairs], np.int32))

@@ -10,7 +10,7 @@ import pytest
 
 from splatam_core.config import load_config
 from splatam_core.interruption import Pressure, no_pressure
-from splatam_core.mapping.backlog import MAX_OWED, MAX_WITHOUT, StepBacklog
+from splatam_core.mapping.backlog import MAX_OWED_FRAMES, MAX_WITHOUT, StepBacklog
 from splatam_core.rasterizer.cpu import CpuRasterizer
 from splatam_core.slam import Slam
 from splatam_core.types import RgbdFrame, Status
@@ -44,19 +44,28 @@ def test_a_frame_takes_fewer_steps_while_others_wait(pressure: Callable[[], Pres
 def test_steps_that_are_owed_are_made_up_for_while_nothing_waits() -> None:
     backlog = StepBacklog()
     assert not list(backlog.due(range(3), gauge(FULL)))
-    assert list(backlog.due(range(3, 6), gauge(WAITING))) == [3]
+    assert list(backlog.due(range(3, 6), gauge(WAITING))) == [0]
     assert not list(backlog.overdue(gauge(WAITING))) and backlog.owed == 5
-    assert list(backlog.overdue(gauge(NONE, NONE, FULL))) == [4, 5]  # the rhythm of half-size steps goes on
-    assert list(backlog.overdue(gauge(NONE))) == [6, 7, 8] and backlog.owed == 0
+    assert list(backlog.overdue(gauge(NONE, NONE, FULL))) == [1, 2]
+    assert list(backlog.overdue(gauge(NONE))) == [3, 4, 5] and backlog.owed == 0
     assert list(backlog.due(range(6, 9), gauge(NONE))) == [6, 7, 8] and backlog.postponed == 0
 
 
-def test_some_steps_are_taken_and_few_are_owed_however_long_the_queue_is_full() -> None:
-    backlog, taken = StepBacklog(), Counter[int]()
-    for number in range(10 * MAX_OWED):
-        taken[number] += len(list(backlog.due(range(3 * number, 3 * number + 3), gauge(FULL))))
-    assert [number for number, count in taken.items() if count] == list(range(MAX_WITHOUT, 10 * MAX_OWED, MAX_WITHOUT + 1))
-    assert set(taken.values()) == {0, 1} and backlog.owed == MAX_OWED
+@pytest.mark.parametrize('pressure', [NONE, WAITING, FULL])
+def test_every_second_step_stays_every_second_one_whatever_waits(pressure: Pressure) -> None:
+    """Four steps a frame: their first would be of full size in every frame, or of half size in every one."""
+    backlog = StepBacklog()
+    taken = [step for first in range(0, 80, 4) for step in backlog.due(range(first, first + 4), gauge(pressure))]
+    assert taken == list(range(len(taken))) and len(taken) >= 5
+
+
+@pytest.mark.parametrize('iterations', [3, 60])
+def test_some_steps_are_taken_and_few_are_owed_however_long_the_queue_is_full(iterations: int) -> None:
+    backlog, taken, num_frames = StepBacklog(), Counter[int](), 10 * MAX_OWED_FRAMES
+    for number in range(num_frames):
+        taken[number] += len(list(backlog.due(range(iterations * number, iterations * (number + 1)), gauge(FULL))))
+    assert [number for number, count in taken.items() if count] == list(range(MAX_WITHOUT, num_frames, MAX_WITHOUT + 1))
+    assert set(taken.values()) == {0, 1} and backlog.owed == MAX_OWED_FRAMES * iterations
 
 
 @pytest.fixture
@@ -123,5 +132,29 @@ def test_views_that_a_correction_has_moved_are_not_fitted_where_they_were(
     slam, _, postponed = run(room(frames=3, width=64), gauge(FULL))
     before = steps[0]
     slam._mapper.correct(lambda frames: np.tile(np.eye(4), (len(frames), 1, 1)))
+    slam.catch_up(no_pressure)
+    assert sum(postponed) and steps[0] == before
+
+
+def test_a_map_catches_up_after_a_frame_that_is_not_mapped(room: Callable[..., Sequence[RgbdFrame]], steps: list[int]) -> None:
+    """Preset quick maps every other frame; those between leave time."""
+    frames = list(room(frames=4, width=64))
+    slam, _, postponed = run(frames[:3], gauge(FULL), 'mapping.every=2')
+    before = steps[0]
+    assert slam.process(frames[3]).status is Status.TRACKED and steps[0] == before  # not mapped
+    slam.catch_up(no_pressure)
+    assert steps[0] - before == sum(postponed) > 0
+
+
+@pytest.mark.parametrize('off', ['mapping.enabled=false', 'mapping.iterations=0'])
+def test_a_map_that_is_fitted_no_more_catches_up_with_nothing(
+    room: Callable[..., Sequence[RgbdFrame]], steps: list[int], off: str
+) -> None:
+    frames = list(room(frames=4, width=64))
+    slam, _, postponed = run(frames[:3], gauge(FULL))
+    before = steps[0]
+    slam.configure(load_config('realtime', ['threads=1', off]))
+    slam.catch_up(no_pressure)
+    assert slam.process(frames[3]).status is Status.TRACKED
     slam.catch_up(no_pressure)
     assert sum(postponed) and steps[0] == before

@@ -33,7 +33,9 @@ def test_pairs_are_those_of_opencv(monkeypatch: pytest.MonkeyPatch, has_extensio
         assert found.distance.tolist() == [pair.distance for pair in expected]
 
 
-def test_without_descriptors_there_are_no_pairs() -> None:
+@pytest.mark.parametrize('has_extension', [True, False])
+def test_without_descriptors_there_are_no_pairs(monkeypatch: pytest.MonkeyPatch, has_extension: bool) -> None:
+    monkeypatch.setattr(matching, 'has_extension', lambda: has_extension)
     none, some = np.empty((0, 32), np.uint8), np.zeros((3, 32), np.uint8)
     for first, second in ((none, some), (some, none), (none, none)):
         assert not len(matching.matched(first, second).first)
