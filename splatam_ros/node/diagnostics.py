@@ -131,9 +131,10 @@ class FrameCounters:
 
     def progress(self, result: FrameResult) -> str:
         """Returns a line for the log, after a frame."""
+        hurried = f'{self.shortened} fitted the map less because others waited, ' if self.shortened else ''
         return (
             f'frame {self.total}: {self.by_status[Status.UNCERTAIN]} uncertain and {self.by_status[Status.LOST]} lost so far, '
-            f'{result.num_gaussians} Gaussians, {result.timings.total:.0f} ms for this frame'
+            f'{hurried}{result.num_gaussians} Gaussians, {result.timings.total:.0f} ms for this frame'
         )
 
 
@@ -247,7 +248,9 @@ def processing_report(before: Sample, now: Sample) -> Report:
         return Report('processing', WARN, f'{refused} frames could not be used', values)
     if dropped:
         return Report('processing', WARN, f'SLAM is slower than the camera: {dropped} frames dropped', values)
-    return Report('processing', OK, f'{done / seconds:.1f} frames per second', values)
+    shortened = now.shortened - before.shortened
+    hurried = f', of {done} frames {shortened} fitted the map less because others waited' if shortened else ''
+    return Report('processing', OK, f'{done / seconds:.1f} frames per second{hurried}', values)
 
 
 def map_report(now: Sample) -> Report:

@@ -237,8 +237,14 @@ def test_frames_that_shorten_mapping_are_counted() -> None:
     for postponed in (0, 2, 0, 3):
         result = FrameResult(0, 1, Status.TRACKED, np.eye(4), False, 9, 1.0, 1.0, '', StageTimings(), postponed_steps=postponed)
         counters.add(result, 'camera')
-    (report,) = [item for item in reports(sample(0), sample(2, shortened=counters.shortened)) if item.name == 'processing']
+    (report,) = [
+        item
+        for item in reports(sample(0), sample(2, frames=counters.by_status, shortened=counters.shortened))
+        if item.name == 'processing'
+    ]
     assert (report.level, report.values['frames that shortened mapping']) == (OK, '2')
+    assert report.text == '2.0 frames per second, of 4 frames 2 fitted the map less because others waited'
+    assert ' 2 fitted the map less' in counters.progress(result)
 
 
 def test_the_map_is_there_for_whoever_comes_after_the_last_frame(graph: Graph, frames: SyntheticSequence) -> None:
