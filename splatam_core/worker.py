@@ -15,6 +15,8 @@ from splatam_core.types import FrameResult, RgbdFrame
 if TYPE_CHECKING:
     from splatam_core.slam import Slam
 
+_log = logging.getLogger(__name__)
+
 T = TypeVar('T')
 WhenFull = Literal['drop_oldest', 'block']
 POLL_S = 0.1  # longest time until ``give_up`` is asked again
@@ -220,18 +222,23 @@ class SlamWorker:
                 self._before_frame(self._slam, frame)
             result = self._slam.process(frame, self._pressure)
             self._on_result(frame, result)
-            if result.status.is_trusted:
-                self._slam.catch_up(self._pressure)
         except Exception as error:  # noqa: BLE001 - whatever it is, the next frame may be fine
             self._report_bad_frame(frame, error)
+            return
+        if result.status.is_trusted:
+            self._catch_up(frame)
+
+    def _catch_up(self, frame: RgbdFrame) -> None:
+        try:
+            self._slam.catch_up(self._pressure)
+        except Exception as error:  # noqa: BLE001 - as above; the frame itself is done
+            _log.error('fitting the map after frame %d ns failed: %r', frame.stamp_ns, error)
 
     def _report_bad_frame(self, frame: RgbdFrame, error: Exception) -> None:
         try:
             self._on_bad_frame(frame, error)
         except Exception as another:  # noqa: BLE001 - likewise
-            logging.getLogger(__name__).error(
-                'frame %d ns failed (%r), and so did the report about it: %r', frame.stamp_ns, error, another
-            )
+            _log.error('frame %d ns failed (%r), and so did the report about it: %r', frame.stamp_ns, error, another)
 
     def _fulfil(self, future: Future[T], function: Callable[[Slam], T]) -> None:
         if not future.set_running_or_notify_cancel():

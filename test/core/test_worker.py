@@ -30,6 +30,7 @@ class HeldSlam:
         self.threads: set[threading.Thread] = set()
         self.pressures: list[Pressure] = []
         self.caught_up: list[Pressure] = []
+        self.is_broken = False
 
     def release(self, frames: int) -> None:
         self.gate.release(frames)
@@ -53,6 +54,8 @@ class HeldSlam:
 
     def catch_up(self, pressure: PressureGauge) -> None:
         self.caught_up.append(pressure())
+        if self.is_broken:
+            raise ZeroDivisionError('broken')
 
 
 class Recorder:
@@ -149,6 +152,19 @@ def test_a_call_presses_and_a_frame_that_is_lost_catches_up_with_nothing() -> No
     called.result(TIMEOUT_S)
     assert slam.pressures == [Pressure.WAITING] and not slam.caught_up
     worker.stop(drain=True)
+
+
+def test_a_frame_that_is_done_is_not_reported_because_the_map_cannot_catch_up(caplog: pytest.LogCaptureFixture) -> None:
+    slam = HeldSlam(held=False)
+    slam.is_broken = True
+    worker, recorder = start(slam, when_full='drop_oldest')
+    worker.submit(frame(1))
+    while worker.pending:
+        threading.Event().wait(0.001)
+    worker.submit(frame(2))
+    worker.stop(drain=True)
+    assert recorder.results == [1, 2] and not recorder.bad
+    assert 'fitting the map after frame 1 ns failed' in caplog.text
 
 
 def test_block_waits_for_room_and_loses_nothing() -> None:
