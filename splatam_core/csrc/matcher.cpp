@@ -28,7 +28,8 @@ inline Words words_of(const std::uint8_t* descriptor) {
     Nearest nearest;
     for (std::size_t k = 0; k < others.size(); ++k) {
       std::int32_t distance = 0;
-      for (std::size_t word = 0; word < own.size(); ++word) distance += __builtin_popcountll(own[word] ^ others[k][word]);
+      for (std::size_t word = 0; word < own.size(); ++word)
+        distance += __builtin_popcountll(own[word] ^ others[k][word]);
       if (distance < nearest.distance) nearest = {distance, std::int32_t(k)};
       if (distance < to_others[k].distance) to_others[k] = {distance, std::int32_t(i)};
     }
@@ -37,8 +38,9 @@ inline Words words_of(const std::uint8_t* descriptor) {
 }
 
 #if defined(__x86_64__)
-[[gnu::target("popcnt")]] void compare_by_popcnt(const std::uint8_t* ours, std::size_t n, const std::vector<Words>& others,
-                                                 std::vector<Nearest>& to_ours, std::vector<Nearest>& to_others) {
+[[gnu::target("popcnt")]] void compare_by_popcnt(const std::uint8_t* ours, std::size_t n,
+                                                 const std::vector<Words>& others, std::vector<Nearest>& to_ours,
+                                                 std::vector<Nearest>& to_others) {
   compare(ours, n, others, to_ours, to_others);
 }
 #endif
