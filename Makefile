@@ -193,10 +193,11 @@ ARM_TAGS := $(foreach glibc,17 24 26 27 28 31 34 35 36,--platform manylinux_2_$(
 ARM_PIP = $(BIN)/python -m pip install --quiet --no-deps --upgrade --target $(1) --only-binary=:all: --python-version 3.11 $(ARM_TAGS)
 ARM_BUILD := CFLAGS='-idirafter $(ARM_ROOT)/usr/include' CXXFLAGS='-idirafter $(ARM_ROOT)/usr/include'
 # What runs there, chosen so that it ends within minutes: small scenes of the contract (images, gradients, steps of
-# fitting), alignment, the checks of arrays, and SLAM of ten frames with one thread and with several.
-ARM_TESTS := test/core/test_rasterizer_contract.py test/core/test_torch_aligner.py test/core/test_native_bindings.py test/core/test_threads.py
+# fitting), alignment, matching, the checks of arrays, and SLAM of ten frames with one thread and with several.
+ARM_TESTS := test/core/test_rasterizer_contract.py test/core/test_torch_aligner.py test/core/test_native_bindings.py test/core/test_threads.py \
+	test/core/test_matching.py
 ARM_CHOSEN := (cpu-1 and (small or by_hand or hides or stops or near_plane)) or generic-size0 or (size2 and native_one) or holes_are \
-	or nothing_in_sight or native_bindings or slam_is_the_same or ((descent or fitted_well) and generic)
+	or nothing_in_sight or native_bindings or slam_is_the_same or weigh or matching or ((descent or fitted_well) and generic)
 
 $(ARM_DIR)/.root:
 	@for program in $(ARM)-g++ $(ARM_QEMU) mmdebstrap; do
