@@ -8,12 +8,12 @@ import re
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from domains import reserve_domain
+from processes import wait_until
 
 from splatam_core.interruption import STOP_SIGNALS, on_stop_signals
 from splatam_core.maps.viewer.browser import find_browser
@@ -42,14 +42,6 @@ def alive(out: Path) -> list[str]:
         except OSError:  # ended meanwhile, or not ours
             continue
     return found
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    """Wait for a condition, or fail."""
-    deadline = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < deadline, 'timed out'
-        time.sleep(0.1)
 
 
 @pytest.fixture(autouse=True)
@@ -106,8 +98,8 @@ def test_a_step_that_fails_is_named(out: Path) -> None:
 
 def test_a_node_that_dies_ends_the_demo_with_its_last_words(out: Path) -> None:
     process = start_demo(out, 'synthetic:frames=30')
-    wait_until(lambda: any('splatam_ros.player.main' in command for command in alive(out)))
-    wait_until(lambda: (out / 'trajectory.txt').is_file())
+    wait_until(lambda: any('splatam_ros.player.main' in command for command in alive(out)), TIMEOUT_S)
+    wait_until(lambda: (out / 'trajectory.txt').is_file(), TIMEOUT_S)
     node = next(
         int(path.parent.name)
         for path in Path('/proc').glob('[0-9]*/cmdline')
@@ -118,7 +110,7 @@ def test_a_node_that_dies_ends_the_demo_with_its_last_words(out: Path) -> None:
     assert process.returncode == 1
     assert 'was killed by SIGKILL' in said
     assert 'node.log' in said
-    wait_until(lambda: not alive(out))  # the viewer notices by itself that the node is gone
+    wait_until(lambda: not alive(out), TIMEOUT_S)  # the viewer notices by itself that the node is gone
 
 
 @pytest.mark.parametrize('number', STOP_SIGNALS)
@@ -140,7 +132,7 @@ def test_a_signal_while_a_process_starts_ends_it(number: signal.Signals, monkeyp
 @pytest.mark.parametrize(('number', 'step'), [(signal.SIGINT, 'convert'), (signal.SIGHUP, 'splatam_ros.player.main')])
 def test_a_signal_ends_every_process(out: Path, number: signal.Signals, step: str) -> None:
     process = start_demo(out, 'synthetic:frames=12')
-    wait_until(lambda: any(step in command for command in alive(out)))
+    wait_until(lambda: any(step in command for command in alive(out)), TIMEOUT_S)
     process.send_signal(number)
     said, _ = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 130, said

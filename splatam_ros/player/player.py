@@ -69,7 +69,7 @@ class Player:
         self._listeners = Listeners(node, {publisher.topic_name: publisher for publisher in awaited})
         self._answer_topics = [AnswerTopic(node, topic, self._answered) for topic in options.wait_for]
         self._clock = PlaybackClock(options.start_ns, options.rate)
-        self._sim_clock = SimClock(node, self._clock, options.clock_hz, options.clock_topics)
+        self._sim_clock = SimClock(node, self._clock, options.end_ns, options.clock_hz, options.clock_topics)
         self._controls = Controls(node, self._clock, keyboard, _say)
         self._back_pressure = BackPressure(
             self._answer_topics, self._clock,

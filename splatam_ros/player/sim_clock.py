@@ -13,19 +13,24 @@ from splatam_ros.player.pacing import PlaybackClock
 
 
 class SimClock:
-    """Publishes ``/clock`` periodically, just before messages of some topics, or both. Time goes back only at a restart."""
+    """Publishes ``/clock`` periodically, just before messages of some topics, or both.
 
-    def __init__(self, node: Node, clock: PlaybackClock, rate_hz: float | None, before: Collection[str]) -> None:
+    Time goes back only at a restart, and never passes the end of what is played.
+    """
+
+    def __init__(self, node: Node, clock: PlaybackClock, end_ns: int, rate_hz: float | None, before: Collection[str]) -> None:
         """Prepare.
 
         Args:
             node: publishes; it gets a publisher only if ``/clock`` is needed.
-            clock: tells the recording time.
+            clock: tells the recording time; it runs on where a message is published late.
+            end_ns: recording time of the end of what is played.
             rate_hz: updates per second of wall time; None = no periodic updates.
             before: recorded topics before whose messages ``/clock`` is published.
         """
         self._publisher = node.create_publisher(Clock, '/clock', 10) if rate_hz or before else None
         self._clock = clock
+        self._end_ns = end_ns
         self._period_s = 1 / rate_hz if rate_hz else float('inf')
         self._before = before
         self._due_s = 0.0
@@ -45,7 +50,7 @@ class SimClock:
         now_s = time.monotonic()
         if self._period_s < float('inf') and now_s >= self._due_s:
             self._due_s = now_s + self._period_s
-            self._publish(self._clock.now_ns())
+            self._publish(min(self._clock.now_ns(), self._end_ns))
 
     def before_message(self, topic: str, time_ns: int) -> None:
         """Publish the time of a message that is about to be published, if its topic asks for it."""

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from processes import wait_until
 
 from splatam_core.cli import main
 from splatam_core.commands import job_runners
@@ -218,13 +217,6 @@ def children(process: int) -> list[int]:
     return [int(child) for path in found for child in path.read_text().split()]
 
 
-def wait_until(condition: Callable[[], object], what: str, seconds: float = 60) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, f'not within {seconds} s: {what}'
-        time.sleep(0.02)
-
-
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_runs_everything(cluster: Callable[[], subprocess.Popen[bytes]], tmp_path: Path) -> None:
     words = ('run', 'synthetic', *TINY, '--preset', 'realtime', '--no-evaluate')
@@ -234,7 +226,7 @@ def test_a_cluster_that_loses_a_worker_runs_everything(cluster: Callable[[], sub
     first = next(outcomes)
     orphan = kill_one_that_works(workers)
     assert [outcome.failure for outcome in (first, *outcomes)] == [''] * 3
-    wait_until(lambda: not is_alive(orphan), 'the run of the worker that was killed has ended, too', seconds=5)
+    wait_until(lambda: not is_alive(orphan), 5.0, lambda: 'the run of the worker that was killed has not ended')
     for job in jobs:
         assert {path.name for path in job.folder.iterdir()} == {
             'trajectory.txt',
@@ -251,9 +243,14 @@ def test_a_cluster_that_loses_a_worker_runs_everything(cluster: Callable[[], sub
 
 def kill_one_that_works(workers: list[subprocess.Popen[bytes]]) -> int:
     """Kills a worker in the middle of a run. Returns the process of that run."""
-    wait_until(lambda: any(children(worker.pid) for worker in workers), 'a worker runs something')
-    worker = next(worker for worker in workers if children(worker.pid))
-    (orphan,) = children(worker.pid)
+    working: list[tuple[subprocess.Popen[bytes], int]] = []
+
+    def found() -> bool:
+        working[:] = [(worker, child) for worker in workers for child in children(worker.pid)]
+        return bool(working)
+
+    wait_until(found, explain=lambda: 'no worker runs anything')
+    worker, orphan = working[0]
     worker.kill()
     worker.wait()
     return orphan
@@ -261,10 +258,9 @@ def kill_one_that_works(workers: list[subprocess.Popen[bytes]]) -> int:
 
 def is_alive(process: int) -> bool:
     try:
-        os.kill(process, 0)
-    except ProcessLookupError:
+        return Path(f'/proc/{process}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except (FileNotFoundError, ProcessLookupError):  # ended, before the file was opened or while it was read
         return False
-    return Path(f'/proc/{process}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
 
 
 def test_a_run_that_fails_on_a_worker_says_why(cluster: Callable[[], subprocess.Popen[bytes]], tmp_path: Path) -> None:

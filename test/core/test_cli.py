@@ -9,14 +9,13 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from processes import Process, run_code
+from processes import Process, run_code, wait_until
 
 from splatam_core.cli import COMMANDS, main
 from splatam_core.commands.frame_notes import FrameNotes
@@ -298,10 +297,12 @@ def long_run(tmp_path: Path) -> Iterator[tuple[Process, Path]]:
     arguments = ['--width', WIDTH, '--max-frames', 500, *SETTINGS, '--out', tmp_path / 'run']
     process = start('run', SOURCE, *arguments, log=tmp_path / 'log')
     trajectory = tmp_path / 'run' / 'trajectory.txt'
-    deadline_s = time.monotonic() + 60
-    while not (trajectory.exists() and trajectory.read_text().count('\n') >= 6):  # some may be uncertain
-        assert process.is_running and time.monotonic() < deadline_s
-        time.sleep(0.02)
+
+    def has_begun() -> bool:
+        assert process.is_running, process.text
+        return trajectory.exists() and trajectory.read_text().count('\n') >= 6  # some may be uncertain
+
+    wait_until(has_begun, explain=lambda: process.text)
     yield process, tmp_path / 'run'
     process.send(signal.SIGKILL)
     process.wait()

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import subprocess
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import rclpy
 from domains import reserve_domain
-from processes import TIMEOUT_S, Process
+from processes import TIMEOUT_S, Patience, Process
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -78,26 +77,27 @@ class Graph:
         self, condition: Callable[[], object], timeout_s: float = TIMEOUT_S, explain: Callable[[], str] = lambda: ''
     ) -> None:
         assert self.node
-        deadline_s = time.monotonic() + timeout_s
+        patience = Patience(timeout_s)
         while not condition():
-            assert time.monotonic() < deadline_s, f'not so within {timeout_s} s. {explain()}'
-            self._executor.spin_once(timeout_sec=0.05)
+            assert not patience.is_over, f'not so within {timeout_s} s. {explain()}'
+            self._executor.spin_once(timeout_sec=Patience.LOOK_S)
 
     def spin_for(self, seconds: float) -> None:
         """Spin for a time in which something must not happen."""
-        deadline_s = time.monotonic() + seconds
-        while time.monotonic() < deadline_s:
-            self._executor.spin_once(timeout_sec=0.05)
+        patience = Patience(seconds)
+        while not patience.is_over:
+            self._executor.spin_once(timeout_sec=Patience.LOOK_S)
 
     def settled(self, count: Callable[[], int], quiet_s: float = 0.5) -> int:
         """Spin until a count has not changed for some time, so that what was on its way has arrived. Returns the count."""
-        last, since_s = count(), time.monotonic()
+        last, quiet = count(), Patience(quiet_s)
 
         def is_quiet() -> bool:
-            nonlocal last, since_s
+            nonlocal last
             if count() != last:
-                last, since_s = count(), time.monotonic()
-            return time.monotonic() - since_s > quiet_s
+                last = count()
+                quiet.restart()
+            return quiet.is_over
 
         self.spin_until(is_quiet, explain=lambda: f'the count is {count()} and grows')
         return last

@@ -16,6 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from processes import Patience
 from rclpy.logging import get_logger
 
 from splatam_core.cli import main
@@ -68,9 +69,9 @@ class Shown:
 
     def until(self, is_so: Callable[[np.ndarray], bool]) -> np.ndarray:
         """Wait for a picture. Returns it."""
-        deadline_s = time.monotonic() + TIMEOUT_S
+        patience = Patience(TIMEOUT_S)
         while not is_so(picture := self.picture()):
-            assert time.monotonic() < deadline_s, f'the page does not show it; errors: {self.errors}'
+            assert not patience.is_over, f'the page does not show it; errors: {self.errors}'
             self._meanwhile()
             self.page.wait_for_timeout(50)
         return picture
