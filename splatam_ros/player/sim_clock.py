@@ -11,6 +11,8 @@ from rosgraph_msgs.msg import Clock
 from msg_adapters import stamps
 from splatam_ros.player.pacing import PlaybackClock
 
+DEPTH = 100  # so that a subscriber that is busy misses no time that precedes a message
+
 
 class SimClock:
     """Publishes ``/clock`` periodically, just before messages of some topics, or both.
@@ -28,7 +30,7 @@ class SimClock:
             rate_hz: updates per second of wall time; None = no periodic updates.
             before: recorded topics before whose messages ``/clock`` is published.
         """
-        self._publisher = node.create_publisher(Clock, '/clock', 10) if rate_hz or before else None
+        self._publisher = node.create_publisher(Clock, '/clock', DEPTH) if rate_hz or before else None
         self._clock = clock
         self._end_ns = end_ns
         self._period_s = 1 / rate_hz if rate_hz else float('inf')

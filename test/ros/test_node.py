@@ -257,7 +257,7 @@ def start_playback(graph: Graph, bag: Path, **parameters: Any) -> tuple[Process,
     """Start node and player, and wait until a third of the recording is processed."""
     out = graph.folder / 'run'
     node = run_node(graph, save_path=out, queue_policy='all', **parameters)
-    player = graph.play(str(bag), '--rate', '1', '--wait-for')
+    player = graph.play(str(bag), '--rate', '0.05', '--wait-for')  # 0.67 s a frame: slower than any machine
     graph.spin_until(lambda: len(trajectory_lines(out)) >= 4, explain=lambda: node.text + player.text)
     return node, player, out
 

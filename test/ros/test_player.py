@@ -127,15 +127,13 @@ def clock_times(messages: list[Clock]) -> list[int]:
     return [message.clock.sec * 10**9 + message.clock.nanosec for message in messages]
 
 
-def test_clock_runs_between_the_messages_from_start_to_end(graph: Graph, bag: Path) -> None:
-    subscribe(graph)
+def test_clock_runs_between_the_messages(graph: Graph, bag: Path) -> None:
+    received = subscribe(graph)
     clock = graph.collect(Clock, '/clock')
-    finish(graph, graph.play(str(bag), '--rate', '0.2', '--clock', '100'))
-    times_ns = clock_times(clock)
-    assert times_ns == sorted(times_ns)
-    between = {time_ns for time_ns in times_ns if 10**9 < time_ns < last_ns(bag)}
-    assert len(between) > 2 * FRAMES  # of the 183 of 1.8 s at 100 Hz: busy cores may cost most of them
-    assert times_ns[-1] <= last_ns(bag)
+    player = graph.play(str(bag), '--rate', '0.05', '--clock', '100')  # 67 in the time of a frame
+    graph.spin_until(lambda: received[RGB] and len(set(clock_times(clock))) > 2 * FRAMES, explain=lambda: player.text)
+    assert clock_times(clock) == sorted(clock_times(clock))
+    assert clock_times(clock)[0] >= 10**9
 
 
 def test_clock_does_not_pass_the_end_where_the_last_messages_are_late(graph: Graph, bag: Path) -> None:
@@ -219,7 +217,7 @@ def test_a_frame_that_nobody_answers_is_named(graph: Graph, bag: Path) -> None:
     assert player.wait() == 1
     # Two were answered, so four more than that were handed out.
     missing = 'first frame not answered: 1.066666666 (image 3)'
-    assert player.says('no answer on /splatam/pose for 5 s', '6 colour images', missing)
+    assert player.says('error: no answer on /splatam/pose for', '6 colour images', missing)
 
 
 def test_any_topic_with_a_header_can_answer(graph: Graph, bag: Path) -> None:
@@ -277,7 +275,7 @@ def test_a_listener_that_leaves_is_reported_with_the_frame_it_missed(graph: Grap
 
 def test_a_stalled_subscriber_holds_the_player_up_even_without_wait_for(graph: Graph, bag: Path) -> None:
     listener = graph.start('-c', LISTENER, RGB, DEPTH, INFO)
-    player = graph.play(str(bag), '--rate', '2')
+    player = graph.play(str(bag), '--rate', '0.2')
     listener.wait_says('3 messages')
     listener.send(signal.SIGSTOP)
     player.wait_says('no answer from its subscribers', 'still waiting')
@@ -308,12 +306,12 @@ def test_space_pauses_and_goes_on(graph: Graph, bag: Path) -> None:
     received = subscribe(graph)
     terminal, stdin = pty.openpty()
     try:
-        player = graph.play(str(bag), '--rate', '0.2', stdin=stdin)
+        player = graph.play(str(bag), '--rate', '0.1', stdin=stdin)
         graph.spin_until(lambda: len(received[RGB]) >= 2, explain=lambda: player.text)
         os.write(terminal, b' ')
         graph.spin_until(lambda: player.says('paused'), explain=lambda: player.text)
         paused_at = graph.settled(lambda: len(received[RGB]))
-        graph.spin_for(7 / 30 / 0.2)  # the time of seven frames
+        graph.spin_for(3 / 30 / 0.1)  # the time of three frames
         assert len(received[RGB]) == paused_at < 12
         os.write(terminal, b' ')
         finish(graph, player)
