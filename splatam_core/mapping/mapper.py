@@ -70,7 +70,7 @@ class Mapper:
         self.rng = np.random.default_rng(config.seed)
         self.scene_radius = 0.0
         self.backlog = StepBacklog()
-        self._last_window = self.keyframes.window([])
+        self._owed_window: Window | None = None  # a frame is held only while steps on it are owed
         self._rasterizer, self._num_frames, self._stop = rasterizer, num_frames, stop
         self.configure(config)
 
@@ -159,14 +159,14 @@ class Mapper:
         """
         if plan.steps is None or not window:
             return 0
-        self._last_window = window
         self._fit(window, self.backlog.due(range(plan.first_step, plan.first_step + plan.steps), pressure))
+        self._owed_window = window if self.backlog.owed else None
         return self.backlog.postponed
 
     def catch_up(self, pressure: PressureGauge) -> None:
         """Takes the steps that were postponed, on the views of the last frame that was mapped, until something waits."""
-        if self.backlog.owed and self._last_window and pressure() is Pressure.NONE:
-            self._fit(self._last_window, self.backlog.overdue(pressure))
+        if self.backlog.owed and self._owed_window is not None and pressure() is Pressure.NONE:
+            self._fit(self._owed_window, self.backlog.overdue(pressure))
 
     def _fit(self, window: Window, steps: Iterable[int]) -> None:
         views = views_to_fit(window, steps, self._config, self.rng)
@@ -177,7 +177,7 @@ class Mapper:
 
         What those frames have moved stays where it is; the steps that follow, on other views, move it back.
         """
-        self._last_window = self.keyframes.window([])
+        self._owed_window = None
         added_before = self.map.added_by < first
         self.keyframes.drop_from(first)
         removed = len(added_before) - int(added_before.sum())
@@ -191,7 +191,7 @@ class Mapper:
         Args:
             motion_of: returns the motions [K, 4, 4] in the world of frames [K].
         """
-        self._last_window = self.keyframes.window([])  # its views are where they were
+        self._owed_window = None  # its views are where they were
         self.map.move(motion_of)
         frames = np.array([keyframe.frame for keyframe in self.keyframes], dtype=np.int64)
         T_cam_world = [keyframe.T_cam_world.double().numpy(force=True) for keyframe in self.keyframes]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Generic, TypeVar
+from weakref import ref
 
 from splatam_core.images.view import View
 
@@ -12,17 +13,25 @@ _NUM_KEPT = 2  # the frame, and the one before
 
 
 class OfNewestViews(Generic[T]):
-    """Computes a function of a view, and keeps the results of the newest views."""
+    """Computes a function of a view, and keeps the results of the newest views for as long as these exist."""
 
     def __init__(self, function: Callable[[View], T]) -> None:
+        """Start without views.
+
+        Args:
+            function: its result must not refer to the view, which would then exist for as long as the result is kept.
+        """
         self._function = function
-        self._kept: list[tuple[View, T]] = []
+        self._kept: list[tuple[ref[View], T]] = []
 
     def of(self, view: View) -> T:
         """Returns the function's result for a view, whose images must not change."""
         for known, result in self._kept:
-            if known is view:
+            if known() is view:
                 return result
         result = self._function(view)
-        self._kept = [*self._kept, (view, result)][-_NUM_KEPT:]
+        self._kept = [*self._kept, (ref(view, self._forget), result)][-_NUM_KEPT:]
         return result
+
+    def _forget(self, gone: ref[View]) -> None:
+        self._kept = [(known, result) for known, result in self._kept if known is not gone]
