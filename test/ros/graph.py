@@ -16,6 +16,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Header
 
 from splatam_core.resources import config_dir
 
@@ -57,6 +58,12 @@ class Graph:
 
     def play(self, *arguments: str, stdin: int = subprocess.DEVNULL) -> Process:
         return self.start('-m', 'splatam_ros.player.main', *arguments, stdin=stdin)
+
+    def play_in_step(self, *arguments: str) -> Process:
+        """Start a player that waits for the node and for this test, which hears all that is published even if it is put aside."""
+        heard = self.publisher(Header, '/heard')
+        self.node.create_subscription(Header, '/splatam/processed', heard.publish, RELIABLE)
+        return self.play(*arguments, '--rate', 'max', '--wait-for', '/heard')
 
     def run_node(self, *ros_arguments: str, **parameters: Any) -> Process:
         return self.start('-m', 'splatam_ros.node.main', *node_arguments(*ros_arguments, **parameters))

@@ -71,7 +71,7 @@ def test_recording_in_poses_renders_cloud_and_folder_out(
     }  # fmt: skip
     topics = [f'/splatam/{topic}' for topic in received]
     graph.spin_until(lambda: all(graph.node.count_publishers(topic) for topic in topics), explain=lambda: node.text)
-    player = graph.play(str(bag), '--rate', 'max', '--wait-for')
+    player = graph.play_in_step(str(bag))
     graph.spin_until(lambda: not node.is_running, explain=lambda: player.text + node.text)
     assert (player.wait(), node.wait()) == (0, 0), player.text + node.text
     assert 'WARN' not in node.text
@@ -372,7 +372,7 @@ def test_a_node_told_to_stop_drops_what_it_has_no_time_for(graph: Graph, frames:
     assert node.wait() == 0, node.text
     assert node.says('WARN', 'frames that waited for SLAM were dropped, because the node was told to stop')
     run = read_run(out)
-    assert before <= len(run.frames) < before + 12  # two seconds of frames, and those whose answer was on its way
+    assert before <= len(run.frames) < 50  # two seconds of frames and those whose answer was on its way: some ten
     assert json.loads((out / 'metrics.json').read_text())['frames'] == len(run.frames)
     assert len(read_ply(out / 'map.ply').means) > 500
 

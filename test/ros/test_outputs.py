@@ -394,7 +394,7 @@ def test_what_was_recorded_of_the_node_plays_back(graph: Graph, tf_message: type
         topic: graph.collect(message_class(info.topic_type), topic, recorder_qos(info.qos_profile), raw=True)
         for topic, info in infos.items()
     }
-    player = graph.play(str(bag), '--rate', 'max', '--wait-for')
+    player = graph.play_in_step(str(bag))
     graph.spin_until(lambda: not node.is_running, explain=lambda: player.text + node.text)
     assert (player.wait(), node.wait()) == (0, 0), player.text + node.text
     graph.spin_until(lambda: len(heard['/splatam/pose']) == len(heard['/tf']) == len(frames) and all(heard.values()))
