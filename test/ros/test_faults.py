@@ -145,7 +145,7 @@ def test_one_message_in_ten_is_lost(graph: Graph, frames: SyntheticSequence) -> 
         live.camera.send(still(frames, number), only=arriving)
         if {'rgb', 'depth'} <= set(arriving):
             expected.append(still(frames, number).stamp_ns)
-    live.wait_done(expected[-1])
+            live.wait_done(expected[-1])  # in a burst, one stream could push its own out before the other stream comes
     assert 40 < len(expected) < 60  # some were lost
     assert [stamps.to_ns(header.stamp) for header in live.done][1:] == expected
     live.wait_says('dropped: colour without depth')
