@@ -15,12 +15,13 @@ FUZZ_MINUTES ?= 10
 export SPLATAM_DATA ?= $(abspath ../shared/data)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup test test-quick fuzz fuzz-long sanitize sanitize-threads lint format docs docs-gallery hooks tf2_msgs lpips demo paper-tables colcon check-aarch64 test-aarch64 wheels clean
+.PHONY: help setup test test-quick test-stalled fuzz fuzz-long sanitize sanitize-threads lint format docs docs-gallery hooks tf2_msgs lpips demo paper-tables colcon check-aarch64 test-aarch64 wheels clean
 
 help:
 	@echo 'make setup           create $(VENV), build the native code and install the package (PYTHON=python3.11 chooses the interpreter)'
 	echo 'make test-quick      run the fast tests: no ROS processes, no recordings, under 2 minutes'
 	echo 'make test            run every test, $(TEST_WORKERS) at a time (TEST_WORKERS=4 changes that)'
+	echo 'make test-stalled    run every test while random processes of theirs are put aside: what fails depends on time; 20 minutes'
 	echo 'make fuzz            try odd and damaged input of every kind for $(FUZZ_MINUTES) minutes (FUZZ_MINUTES=1 changes that)'
 	echo 'make fuzz-long       the same until every kind has had its number of inputs: hours; continues where it stopped'
 	echo 'make sanitize        run tests and fuzz of the native code with the address and undefined-behaviour sanitizers of g++'
@@ -77,6 +78,9 @@ test: setup tf2_msgs
 
 test-quick: setup
 	@$(BIN)/python -m pytest -q -n $(TEST_WORKERS) --dist worksteal -m 'not slow and not ros and not recording'
+
+test-stalled: setup tf2_msgs
+	@$(BIN)/python tools/stalled_tests.py -q -n $(TEST_WORKERS) --dist worksteal
 
 fuzz: setup
 	@$(BIN)/python test/fuzz/run.py --minutes $(FUZZ_MINUTES)
