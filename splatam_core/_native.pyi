@@ -61,7 +61,6 @@ class Engine:
         log_scales: Floats,
         logit_opacities: Floats,
         rgb: Floats,
-        images: Sequence[Floats],
         image_gradients: Sequence[Floats],
         means_gradient: Floats | None,
         log_scales_gradient: Floats | None,
@@ -69,7 +68,7 @@ class Engine:
         rgb_gradient: Floats | None,
         pose_gradient: Floats,
     ) -> None:
-        """Writes gradients of a loss, given those by the three images, which must be as drawn.
+        """Writes gradients of a loss, given those by the three images.
 
         The gradients by the Gaussians must be zero before; None where one is not wanted. ``pose_gradient`` is [4, 4].
         """

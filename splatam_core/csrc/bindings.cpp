@@ -104,14 +104,13 @@ ConstImages images_of(const std::array<py::object, 3>& images, const char* name,
 }
 
 void backward(Engine& engine, View& view, const py::object& means, const py::object& log_scales,
-              const py::object& logit_opacities, const py::object& rgb, const std::array<py::object, 3>& images,
+              const py::object& logit_opacities, const py::object& rgb,
               const std::array<py::object, 3>& image_gradients, const py::object& means_gradient,
               const py::object& log_scales_gradient, const py::object& logit_opacities_gradient,
               const py::object& rgb_gradient, const py::object& pose_gradient) {
   const auto n = py::ssize_t(view.num_gaussians);
   values<float>(means, "means", {n, 3});  // as many as the view was drawn of
   const GaussianArrays gaussians = GivenGaussians{means, log_scales, logit_opacities, rgb}.read();
-  const ConstImages drawn = images_of(images, "images", view.camera);
   const ConstImages gradients = images_of(image_gradients, "image_gradients", view.camera);
   const MapGradients map{written_or_null<float>(means_gradient, "means_gradient", {n, 3}),
                          written_or_null<float>(log_scales_gradient, "log_scales_gradient", {n, 1}),
@@ -119,7 +118,7 @@ void backward(Engine& engine, View& view, const py::object& means, const py::obj
                          written_or_null<float>(rgb_gradient, "rgb_gradient", {n, 3})};
   float* pose = written<float>(pose_gradient, "pose_gradient", {4, 4});
   py::gil_scoped_release release;
-  engine.backward(view, gaussians, drawn, gradients, map, pose);
+  engine.backward(view, gaussians, gradients, map, pose);
 }
 
 double fit(Engine& engine, const py::object& means, const py::object& log_scales, const py::object& logit_opacities,
@@ -463,9 +462,9 @@ void bind_engine(py::module_& module) {
            py::arg("rgb"), py::arg("bounds"), py::arg("T_cam_world"), py::arg("camera"), py::arg("image"),
            py::arg("depth"), py::arg("silhouette"))
       .def("backward", &backward, py::arg("view"), py::kw_only(), py::arg("means"), py::arg("log_scales"),
-           py::arg("logit_opacities"), py::arg("rgb"), py::arg("images"), py::arg("image_gradients"),
-           py::arg("means_gradient"), py::arg("log_scales_gradient"), py::arg("logit_opacities_gradient"),
-           py::arg("rgb_gradient"), py::arg("pose_gradient"))
+           py::arg("logit_opacities"), py::arg("rgb"), py::arg("image_gradients"), py::arg("means_gradient"),
+           py::arg("log_scales_gradient"), py::arg("logit_opacities_gradient"), py::arg("rgb_gradient"),
+           py::arg("pose_gradient"))
       .def("fit", &fit, py::kw_only(), py::arg("means"), py::arg("log_scales"), py::arg("logit_opacities"),
            py::arg("rgb"), py::arg("bounds"), py::arg("moments"), py::arg("steps"), py::arg("rates"),
            py::arg("T_cam_world"), py::arg("camera"), py::arg("target_rgb"), py::arg("target_depth"),

@@ -343,15 +343,22 @@ void sum_gradients(View& view, std::size_t block, BlockSums& sums) {
 
 }  // namespace
 
-void Engine::backward(View& view, const GaussianArrays& gaussians, const ConstImages& drawn,
-                      const ConstImages& gradient, const MapGradients& map, float pose_gradient[12]) {
+float* Engine::Scratch::for_splats(std::size_t count) {
+  constexpr std::size_t kVector = kScratchAlignment / sizeof(float);
+  grow(of_splats, count * kScratchPerSplat + kVector);
+  const auto address = reinterpret_cast<std::uintptr_t>(of_splats.data()) / sizeof(float);
+  return of_splats.data() + (kVector - address % kVector) % kVector;
+}
+
+void Engine::backward(View& view, const GaussianArrays& gaussians, const ConstImages& gradient, const MapGradients& map,
+                      float pose_gradient[12]) {
   std::lock_guard<std::mutex> lock(mutex_);
   const bool any_map = map.means || map.log_scales || map.logit_opacities || map.rgb;
   make_room_for_gradients(view);
-  for_rows(view, [&](int row, Scratch&) {
+  for_rows(view, [&](int row, Scratch& scratch) {
     SplatGradient* gradients = cleared_gradients(view, row);
     for_tiles(view, row, [&](const TileList& tile, const Splat* members) {
-      kernels_.backward(tile, members, view.camera, drawn, gradient, any_map, gradients);
+      kernels_.backward(tile, members, view.camera, gradient, any_map, scratch.for_splats(tile.count), gradients);
     });
   });
   std::vector<std::array<double, 12>> pose_sums(view.num_blocks);
@@ -369,14 +376,6 @@ void Engine::backward(View& view, const GaussianArrays& gaussians, const ConstIm
   }
 }
 
-float* Engine::Scratch::for_footprints(std::size_t count) {
-  constexpr std::size_t kVector = 8;  // floats; the kernels need aligned vectors
-  const std::size_t size = count * kFloatsPerFootprint + kVector;
-  if (footprints.size() < size) footprints.resize(2 * size);
-  const auto address = reinterpret_cast<std::uintptr_t>(footprints.data()) / sizeof(float);
-  return footprints.data() + (kVector - address % kVector) % kVector;
-}
-
 double Engine::fit(const MutableGaussians& gaussians, std::size_t count, float* bounds, const AdamState& adam,
                    const AdamRates& rates, const Camera& camera, const Pose& pose, const Target& target) {
   std::lock_guard<std::mutex> lock(mutex_);
@@ -389,7 +388,7 @@ double Engine::fit(const MutableGaussians& gaussians, std::size_t count, float* 
     SplatGradient* gradients = cleared_gradients(*view, row);
     double loss = 0.0;
     for_tiles(*view, row, [&](const TileList& tile, const Splat* members) {
-      loss += kernels_.fit(tile, members, camera, target, scratch.for_footprints(tile.count), gradients);
+      loss += kernels_.fit(tile, members, camera, target, scratch.for_splats(tile.count), gradients);
     });
     losses[row] = loss;
   });

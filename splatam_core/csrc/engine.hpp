@@ -73,8 +73,8 @@ class Engine : public std::enable_shared_from_this<Engine> {
 
   // Writes the gradients by the visible Gaussians (the others are not written: zero map.* before) and by the upper
   // three rows of the pose.
-  void backward(View&, const GaussianArrays&, const ConstImages& drawn, const ConstImages& gradient,
-                const MapGradients& map, float pose_gradient[12]);
+  void backward(View&, const GaussianArrays&, const ConstImages& gradient, const MapGradients& map,
+                float pose_gradient[12]);
 
   // Takes one Adam step of the visible Gaussians towards a target (Huber loss). Returns the loss before the step.
   double fit(const MutableGaussians&, std::size_t count, float* bounds, const AdamState&, const AdamRates&,
@@ -86,9 +86,9 @@ class Engine : public std::enable_shared_from_this<Engine> {
   // Memory of one thread, reused.
   struct Scratch {
     std::vector<std::uint64_t> keys, sorted;  // depth bits << 32 | member
-    std::vector<float> footprints;            // of Kernels::fit
+    std::vector<float> of_splats;             // of Kernels::backward and Kernels::fit
 
-    float* for_footprints(std::size_t count);
+    float* for_splats(std::size_t count);
   };
 
   std::shared_ptr<View> borrow_view();

@@ -98,7 +98,8 @@ struct AdamRates {
   float means, log_scales, logit_opacities, rgb;
 };
 
-constexpr int kFloatsPerFootprint = 17;  // size of a Footprint and of the groups it reaches, see kernels.inl
+constexpr int kScratchPerSplat = 129;  // floats: alpha and weight in each pixel of a tile, and where it is seen
+constexpr int kScratchAlignment = 64;  // bytes
 
 struct TileList {
   int x, y;  // pixel of its upper left corner
@@ -142,12 +143,13 @@ struct Kernels {
   std::size_t (*project)(const GaussianArrays&, const Camera&, const Pose&, std::size_t begin, std::size_t end,
                          Splat* splats, TileRect* rects, std::uint32_t* ids);
   void (*forward)(const TileList&, const Splat*, const Camera&, const Images&);
-  // Adds to the gradients. Skips those by the colours unless `map` is set.
-  void (*backward)(const TileList&, const Splat*, const Camera&, const ConstImages& drawn, const ConstImages& gradient,
-                   bool map, SplatGradient* gradients);
-  // Blends a tile, compares it with the target (Huber) and adds the gradients. Returns the tile's loss.
-  // `footprints` is scratch memory of kFloatsPerFootprint floats per splat of the list.
-  double (*fit)(const TileList&, const Splat* splats, const Camera&, const Target&, float* footprints,
+  // Adds to the gradients. Skips those by the colours unless `map` is set. `scratch` is memory of kScratchPerSplat
+  // floats per splat of the list, aligned to kScratchAlignment.
+  void (*backward)(const TileList&, const Splat*, const Camera&, const ConstImages& gradient, bool map, float* scratch,
+                   SplatGradient* gradients);
+  // Blends a tile, compares it with the target (Huber) and adds the gradients. Returns the tile's loss. `scratch` is as
+  // in `backward`.
+  double (*fit)(const TileList&, const Splat* splats, const Camera&, const Target&, float* scratch,
                 SplatGradient* gradients);
 
   // Writes the gradients of `count` splats by the Gaussians ids[i], where they are wanted, and adds those by the upper

@@ -122,7 +122,7 @@ constexpr Groups kAllGroups = kRows == 1 ? 0xff : 0x55;
 
 static inline Groups groups_of(Groups rows) { return kRows == 1 ? rows : (rows | rows >> 1) & kAllGroups; }
 
-// Returns the groups with a pixel that is not saturated. Group is Pixels or PixelGradients. Call it at least every 16
+// Returns the groups with a pixel that is not saturated. Group has a transmittance T. Call it at least every 16
 // splats: it also resets the transmittance of saturated pixels, before that becomes a denormal number.
 template <typename Group>
 static inline Groups open_groups(Group* rows) {
@@ -187,16 +187,31 @@ struct Values {
 
 static inline Values values_of(const Splat& s) { return {uniform(s.r), uniform(s.g), uniform(s.b), uniform(s.z)}; }
 
-template <bool kSilhouette>
-static inline void blend(Pixels& pixels, Rows raw_alpha, const Values& s) {
+// What a splat takes in a group of rows: its alpha, and its weight, which is alpha times transmittance. Both are zero
+// in pixels that it does not reach, and in those that are saturated.
+struct Taken {
+  Rows alpha, w;
+};
+
+// Lowers the transmittance by a splat.
+static inline Taken take(Rows& T, Rows raw_alpha) {
   const Rows alpha = keep(raw_alpha >= kMinAlpha, min(raw_alpha, kMaxAlpha));
-  const Rows w = keep(pixels.T >= kMinTransmittance, alpha * pixels.T);
+  const Rows taken = keep(T >= kMinTransmittance, alpha), w = taken * T;
+  T *= 1.0f - alpha;  // also in saturated pixels: the shortest path to the next splat's T
+  return {taken, w};
+}
+
+// Returns what the splat takes.
+template <bool kSilhouette>
+static inline Taken blend(Pixels& pixels, Rows raw_alpha, const Values& s) {
+  const Taken taken = take(pixels.T, raw_alpha);
+  const Rows w = taken.w;
   pixels.r += w * s.r;
   pixels.g += w * s.g;
   pixels.b += w * s.b;
   pixels.depth += w * s.z;
   if (kSilhouette) pixels.silhouette += w;
-  pixels.T *= 1.0f - alpha;  // also in saturated pixels: the shortest path to the next splat's T
+  return taken;
 }
 
 // Returns rows whose values are the same in all columns.
@@ -234,31 +249,30 @@ static inline void find_reached(Batch& batch, Groups open, std::uint8_t* groups)
   store(batch.reached, by_row);
 }
 
-// Blends a batch into a tile, group of rows by group, so that the pixels stay in registers. What a splat does not
-// reach is skipped: it would add zeros.
-template <bool kSilhouette>
-static inline void blend(Pixels* pixels, const Batch& batch, Groups open) {
+// Calls visit(group, its number, splat of the batch) where the splats of a batch are seen, group of rows by group, so
+// that its pixels stay in registers. What a splat does not reach is skipped: it would add zeros.
+template <typename Group, typename Visit>
+static inline void for_reached(Group* groups, const Batch& batch, Groups open, const Visit& visit) {
   for (; open != 0; open &= open - 1) {
     const int row = __builtin_ctz(open), i = row / kRows;
-    Pixels rows = pixels[i];
-    for (auto left = Groups(batch.reached[row] | batch.reached[row + kRows - 1]); left != 0; left &= left - 1) {
-      const int k = __builtin_ctz(left);
-      blend<kSilhouette>(rows, raw_alpha(batch.footprints[k], i), batch.values[k]);
-    }
-    pixels[i] = rows;
+    Group rows = groups[i];
+    for (auto left = Groups(batch.reached[row] | batch.reached[row + kRows - 1]); left != 0; left &= left - 1)
+      visit(rows, i, __builtin_ctz(left));
+    groups[i] = rows;
   }
 }
 
-static void forward(const TileList& tile, const Splat* splats, const Camera& camera, const Images& images) {
-  const std::size_t plane = std::size_t(camera.width) * camera.height;
-  Pixels pixels[kGroups];
-  start(pixels, tile, camera);
+// Calls visit(batch, the groups that are open, number of its first splat) for a tile's splats, front to back, until the
+// tile is saturated. Returns how many splats that were. Group is as in open_groups().
+template <typename Group, typename Visit>
+static inline std::size_t for_batches(Group* rows, const TileList& tile, const Splat* splats, const Visit& visit) {
   const Corner at = corner(tile);
   Footprint footprints[kBatch];
   Batch batch;
   batch.footprints = footprints;
-  for (std::size_t first = 0; first < tile.count; first += kBatch) {
-    const Groups open = open_groups(pixels);
+  std::size_t first = 0;
+  for (; first < tile.count; first += batch.size) {
+    const Groups open = open_groups(rows);
     if (open == 0) break;
     batch.size = tile.count - first < kBatch ? tile.count - first : kBatch;
     for (std::size_t k = 0; k < batch.size; ++k) {
@@ -266,9 +280,21 @@ static void forward(const TileList& tile, const Splat* splats, const Camera& cam
       batch.values[k] = values_of(s);
       footprints[k] = footprint(s, at);
     }
-    find_reached(batch, open, nullptr);
-    blend<true>(pixels, batch, open);
+    visit(batch, open, first);
   }
+  return first;
+}
+
+static void forward(const TileList& tile, const Splat* splats, const Camera& camera, const Images& images) {
+  const std::size_t plane = std::size_t(camera.width) * camera.height;
+  Pixels pixels[kGroups];
+  start(pixels, tile, camera);
+  for_batches(pixels, tile, splats, [&](Batch& batch, Groups open, std::size_t) {
+    find_reached(batch, open, nullptr);
+    for_reached(pixels, batch, open, [&](Pixels& rows, int i, int k) {
+      blend<true>(rows, raw_alpha(batch.footprints[k], i), batch.values[k]);
+    });
+  });
   for (int i = 0; i < kGroups; ++i) {
     store_rows(images.rgb, tile, camera, kRows * i, pixels[i].r);
     store_rows(images.rgb + plane, tile, camera, kRows * i, pixels[i].g);
@@ -278,38 +304,35 @@ static void forward(const TileList& tile, const Splat* splats, const Camera& cam
   }
 }
 
-// A group of rows in the backward pass, which also goes front to back.
+// A group of rows in the backward pass, which goes back to front.
 struct PixelGradients {
-  Rows T, Q;                        // transmittance; the part of sum_k w_k q_k that is still to come, see blend_back()
   Rows r, g, b, depth, silhouette;  // gradients of the loss by the pixel's values
+  Rows behind;                      // see blend_back()
 };
 
 // The sums of blend_back() over the groups of rows.
 struct Sums {
-  Rows by_alpha, by_y, by_y_squared, by_r, by_g, by_b, by_z;
+  FoldedRows by_alpha, by_y, by_y_squared, by_r, by_g, by_b, by_z;
 };
 
-// The backward pass of one splat in a group of rows, dy pixels below it. With q_k = sum over channels of (gradient of
-// the channel times value of splat k), dL/dalpha_k = T_k q_k - Q / (1 - alpha_k).
+// The backward pass of one splat in a group of rows, dy pixels below it. With q = sum over channels of (gradient of the
+// channel times value of the splat), dL/dalpha = T (q - behind), where `behind` is the blend of the q behind the splat.
 template <bool kMap, bool kSilhouette>
-static inline void blend_back(PixelGradients& at, const Values& s, Rows raw, Rows dy, Sums& sums) {
-  const Rows alpha = keep(raw >= kMinAlpha, min(raw, kMaxAlpha));
-  const IntRows takes = at.T >= kMinTransmittance;
-  const Rows w = keep(takes, alpha * at.T), left = 1.0f - alpha;
+static inline void blend_back(PixelGradients& at, const Values& s, const Taken& taken, Rows dy, Sums& sums) {
   Rows q = at.r * s.r + at.g * s.g + at.b * s.b + at.depth * s.z;
   if (kSilhouette) q += at.silhouette;
-  at.Q -= w * q;
-  const Rows gradient_by_log_alpha = keep(takes & (raw <= kMaxAlpha), alpha * (at.T * q - at.Q / left));
-  sums.by_alpha += gradient_by_log_alpha;
-  sums.by_y += gradient_by_log_alpha * dy;
-  sums.by_y_squared += gradient_by_log_alpha * dy * dy;
+  const Rows more = q - at.behind;
+  at.behind += taken.alpha * more;
+  const Rows by_log_alpha = keep(taken.alpha < kMaxAlpha, taken.w * more), by_y = by_log_alpha * dy;
+  add(sums.by_alpha, by_log_alpha);
+  add(sums.by_y, by_y);
+  add_product(sums.by_y_squared, by_y, dy);
   if (kMap) {
-    sums.by_r += w * at.r;
-    sums.by_g += w * at.g;
-    sums.by_b += w * at.b;
+    add_product(sums.by_r, taken.w, at.r);
+    add_product(sums.by_g, taken.w, at.g);
+    add_product(sums.by_b, taken.w, at.b);
   }
-  sums.by_z += w * at.depth;
-  at.T *= left;
+  add_product(sums.by_z, taken.w, at.depth);
 }
 
 // Which rows a tile's groups hold.
@@ -322,7 +345,7 @@ struct RowNumbers {
 
 // The backward pass of one splat in some groups of a tile's rows.
 template <bool kMap, bool kSilhouette>
-static inline void blend_back(PixelGradients* rows, const Splat& s, const Corner& tile, const Footprint& f,
+static inline void blend_back(PixelGradients* rows, const Splat& s, const Corner& tile, const Taken* taken,
                               const RowNumbers& numbers, Groups groups, SplatGradient& gradient) {
   if (groups == 0) return;
   const Values values = values_of(s);
@@ -330,7 +353,7 @@ static inline void blend_back(PixelGradients* rows, const Splat& s, const Corner
   Sums by{};
   for (; groups != 0; groups &= groups - 1) {
     const int i = __builtin_ctz(groups) / kRows;
-    blend_back<kMap, kSilhouette>(rows[i], values, raw_alpha(f, i), numbers.of[i] + above, by);
+    blend_back<kMap, kSilhouette>(rows[i], values, taken[i], numbers.of[i] + above, by);
   }
   const Lanes dx = iota() + (tile.x - uniform(s.u));
   const Lanes by_column = folded(by.by_alpha), by_x = by_column * dx;
@@ -350,42 +373,72 @@ static inline void fetch(const Splat* splats, SplatGradient* gradients, std::uin
   __builtin_prefetch(gradients + member, 1);
 }
 
+// What the splats of a tile take, front to back.
+struct TakenByAll {
+  Taken* of_splats;      // kGroups for each
+  std::uint8_t* groups;  // those in which it is seen
+  std::size_t count;     // of the splats in front of what saturates the tile
+};
+static_assert(kGroups * sizeof(Taken) + 1 <= kScratchPerSplat * sizeof(float), "scratch is allocated elsewhere");
+
+// Blends a tile. Calls blend(group, raw alpha, values of the splat), which returns what the splat takes.
+template <typename Group, typename Blend>
+static inline TakenByAll take_all(Group* rows, const TileList& tile, const Splat* splats, float* scratch,
+                                  const Blend& blend) {
+  TakenByAll all{};
+  all.of_splats = reinterpret_cast<Taken*>(scratch);
+  all.groups = reinterpret_cast<std::uint8_t*>(all.of_splats + kGroups * tile.count);
+  all.count = for_batches(rows, tile, splats, [&](Batch& batch, Groups open, std::size_t first) {
+    find_reached(batch, open, all.groups + first);
+    Taken* taken = all.of_splats + kGroups * first;
+    for_reached(rows, batch, open, [&](Group& group, int i, int k) {
+      taken[kGroups * k + i] = blend(group, raw_alpha(batch.footprints[k], i), batch.values[k]);
+    });
+  });
+  return all;
+}
+
+// The backward pass of a tile: adds to the gradients.
+template <bool kMap, bool kSilhouette>
+static inline void blend_back(PixelGradients* rows, const TileList& tile, const Splat* splats, const TakenByAll& all,
+                              SplatGradient* gradients) {
+  const Corner at = corner(tile);
+  const RowNumbers numbers;
+  for (std::size_t k = all.count; k-- > 0;) {
+    if (k >= kAhead) fetch(splats, gradients, tile.splats[k - kAhead]);
+    const std::uint32_t member = tile.splats[k];
+    blend_back<kMap, kSilhouette>(rows, splats[member], at, all.of_splats + kGroups * k, numbers, all.groups[k],
+                                  gradients[member]);
+  }
+}
+
 template <bool kMap>
 static inline void backward_tile(const TileList& tile, const Splat* splats, const Camera& camera,
-                                 const ConstImages& drawn, const ConstImages& gradient, SplatGradient* gradients) {
+                                 const ConstImages& gradient, float* scratch, SplatGradient* gradients) {
+  struct Transmittance {
+    Rows T;
+  } transmittances[kGroups];
+  for (int i = 0; i < kGroups; ++i) transmittances[i].T = first_transmittance(tile, camera, kRows * i);
+  const TakenByAll all =
+      take_all(transmittances, tile, splats, scratch,
+               [](Transmittance& rows, Rows raw_alpha, const Values&) { return take(rows.T, raw_alpha); });
   const std::size_t plane = std::size_t(camera.width) * camera.height;
-  const Corner at = corner(tile);
   PixelGradients rows[kGroups];
   for (int i = 0; i < kGroups; ++i) {
     const auto load = [&](const float* image) { return load_rows(image, tile, camera, kRows * i); };
-    PixelGradients& to = rows[i];
-    to.T = first_transmittance(tile, camera, kRows * i);
-    to.r = load(gradient.rgb), to.g = load(gradient.rgb + plane), to.b = load(gradient.rgb + 2 * plane);
-    to.depth = load(gradient.depth), to.silhouette = load(gradient.silhouette);
-    to.Q = to.r * load(drawn.rgb) + to.g * load(drawn.rgb + plane) + to.b * load(drawn.rgb + 2 * plane) +
-           to.depth * load(drawn.depth) + to.silhouette * load(drawn.silhouette);
+    rows[i] = {load(gradient.rgb),   load(gradient.rgb + plane), load(gradient.rgb + 2 * plane),
+               load(gradient.depth), load(gradient.silhouette),  Rows{}};
   }
-  const RowNumbers numbers;
-  Groups open = kAllGroups;
-  for (std::size_t k = 0; k < tile.count; ++k) {
-    if (k % 8 == 7 && (open = open_groups(rows)) == 0) break;
-    if (k + kAhead < tile.count) fetch(splats, gradients, tile.splats[k + kAhead]);
-    const Splat& s = splats[tile.splats[k]];
-    const Footprint f = footprint(s, at);
-    const Groups reached = groups_of(bits_of_mask(reached_rows(f))) & open;
-    blend_back<kMap, true>(rows, s, at, f, numbers, reached, gradients[tile.splats[k]]);
-  }
+  blend_back<kMap, true>(rows, tile, splats, all, gradients);
 }
 
-static void backward(const TileList& tile, const Splat* splats, const Camera& camera, const ConstImages& drawn,
-                     const ConstImages& gradient, bool map, SplatGradient* gradients) {
+static void backward(const TileList& tile, const Splat* splats, const Camera& camera, const ConstImages& gradient,
+                     bool map, float* scratch, SplatGradient* gradients) {
   if (map)
-    backward_tile<true>(tile, splats, camera, drawn, gradient, gradients);
+    backward_tile<true>(tile, splats, camera, gradient, scratch, gradients);
   else
-    backward_tile<false>(tile, splats, camera, drawn, gradient, gradients);
+    backward_tile<false>(tile, splats, camera, gradient, scratch, gradients);
 }
-
-static_assert(sizeof(Footprint) + 1 <= kFloatsPerFootprint * sizeof(float), "scratch is allocated elsewhere");
 
 static inline Lanes load_bytes(const std::uint8_t* pixels, int columns, int channel) {
   std::int32_t values[8] = {};
@@ -393,9 +446,9 @@ static inline Lanes load_bytes(const std::uint8_t* pixels, int columns, int chan
   return to_float(load(values)) * (1.0f / 255.0f);
 }
 
-// Huber's loss of one row, its gradient by the pixel values, and Q of blend_back() before the first splat.
+// Huber's loss of one row, and its gradient by the pixel values.
 struct Comparison {
-  Lanes r, g, b, depth, Q;
+  Lanes r, g, b, depth;
   double loss;
 };
 
@@ -442,7 +495,6 @@ static inline Comparison compare(Lanes r, Lanes g, Lanes b, Lanes depth, const T
   result.loss = sum(loss);
   result.r = to.color.weight * by_r, result.g = to.color.weight * by_g, result.b = to.color.weight * by_b;
   result.depth = to.depth.weight * by_range;
-  result.Q = result.r * r + result.g * g + result.b * b + result.depth * depth;
   return result;
 }
 
@@ -456,51 +508,29 @@ static inline double start(PixelGradients& rows, const Pixels& drawn, const Tile
                           camera, row + i, to);
     loss += compared[i].loss;
   }
-  rows = {first_transmittance(tile, camera, row),
-          rows_of([&](int i) { return compared[i].Q; }),
-          rows_of([&](int i) { return compared[i].r; }),
+  rows = {rows_of([&](int i) { return compared[i].r; }),
           rows_of([&](int i) { return compared[i].g; }),
           rows_of([&](int i) { return compared[i].b; }),
           rows_of([&](int i) { return compared[i].depth; }),
+          Rows{},
           Rows{}};
   return loss;
 }
 
 static double fit(const TileList& tile, const Splat* splats, const Camera& camera, const Target& target, float* scratch,
                   SplatGradient* gradients) {
-  Footprint* footprints = reinterpret_cast<Footprint*>(scratch);
-  std::uint8_t* groups = reinterpret_cast<std::uint8_t*>(footprints + tile.count);  // in which a splat is seen
   Pixels pixels[kGroups];
   start(pixels, tile, camera);
-  const Corner at = corner(tile);
-  Batch batch;
-  std::size_t count = 0;
-  while (count < tile.count) {
-    const Groups open = open_groups(pixels);
-    if (open == 0) break;
-    batch.size = tile.count - count < kBatch ? tile.count - count : kBatch;
-    batch.footprints = footprints + count;
-    for (std::size_t k = 0; k < batch.size; ++k) {
-      const Splat& s = splats[tile.splats[count + k]];
-      batch.values[k] = values_of(s);
-      footprints[count + k] = footprint(s, at);
-    }
-    find_reached(batch, open, groups + count);
-    blend<false>(pixels, batch, open);
-    count += batch.size;
-  }
+  const TakenByAll all = take_all(pixels, tile, splats, scratch, [](Pixels& rows, Rows raw_alpha, const Values& s) {
+    return blend<false>(rows, raw_alpha, s);
+  });
   const Compared to{target, huber(target.color_weight, target.color_limit),
                     huber(target.depth_weight, target.depth_limit)};
   double loss = 0.0;
   PixelGradients rows[kGroups];
   for (int i = 0; i < kGroups; ++i) loss += start(rows[i], pixels[i], tile, camera, kRows * i, to);
   if (loss < double(target.enough) * (columns_of(tile, camera) * rows_in(tile, camera))) return loss;
-  const RowNumbers numbers;
-  for (std::size_t k = 0; k < count; ++k) {
-    const std::uint32_t member = tile.splats[k];
-    if (k + kAhead < count) fetch(splats, gradients, tile.splats[k + kAhead]);
-    blend_back<true, false>(rows, splats[member], at, footprints[k], numbers, groups[k], gradients[member]);
-  }
+  blend_back<true, false>(rows, tile, splats, all, gradients);
   return loss;
 }
 

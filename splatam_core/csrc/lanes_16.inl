@@ -173,5 +173,9 @@ static inline Rows rows_of(const MakeRow& row) {
 
 static inline Lanes row_of(Rows rows, int) { return rows; }
 static inline Rows repeated(Lanes row) { return row; }
-static inline Lanes folded(Rows rows) { return rows; }
+
+typedef Rows FoldedRows;
+static inline void add(FoldedRows& sum, Rows a) { sum += a; }
+static inline void add_product(FoldedRows& sum, Rows a, Rows b) { sum += a * b; }
+static inline Lanes folded(FoldedRows sum) { return sum; }
 static inline Rows min(Rows a, float b) { return min(a, splat(b)); }

@@ -102,6 +102,12 @@ static inline bool any(IntRows mask) {
   return any(__builtin_shufflevector(mask, mask, 0, 1, 2, 3, 4, 5, 6, 7) |
              __builtin_shufflevector(mask, mask, 8, 9, 10, 11, 12, 13, 14, 15));
 }
+
+// A sum whose rows are added at the end.
+typedef Rows FoldedRows;
+static inline void add(FoldedRows& sum, Rows a) { sum += a; }
+static inline void add_product(FoldedRows& sum, Rows a, Rows b) { sum += a * b; }
+static inline Lanes folded(FoldedRows sum) { return upper(sum) + lower(sum); }
 #else
 struct Rows {
   Lanes upper, lower;
@@ -120,16 +126,13 @@ static inline Lanes lower(Rows rows) { return rows.lower; }
 static inline Rows operator+(Rows a, Rows b) { return {a.upper + b.upper, a.lower + b.lower}; }
 static inline Rows operator-(Rows a, Rows b) { return {a.upper - b.upper, a.lower - b.lower}; }
 static inline Rows operator*(Rows a, Rows b) { return {a.upper * b.upper, a.lower * b.lower}; }
-static inline Rows operator/(Rows a, Rows b) { return {a.upper / b.upper, a.lower / b.lower}; }
 static inline Rows operator+(Rows a, float b) { return {a.upper + b, a.lower + b}; }
 static inline Rows operator-(float a, Rows b) { return {a - b.upper, a - b.lower}; }
 static inline Rows operator*(Rows a, float b) { return {a.upper * b, a.lower * b}; }
 static inline Rows& operator+=(Rows& a, Rows b) { return a = a + b; }
-static inline Rows& operator-=(Rows& a, Rows b) { return a = a - b; }
 static inline Rows& operator*=(Rows& a, Rows b) { return a = a * b; }
 static inline IntRows operator>=(Rows a, float b) { return {a.upper >= b, a.lower >= b}; }
-static inline IntRows operator<=(Rows a, float b) { return {a.upper <= b, a.lower <= b}; }
-static inline IntRows operator&(IntRows a, IntRows b) { return {a.upper & b.upper, a.lower & b.lower}; }
+static inline IntRows operator<(Rows a, float b) { return {a.upper < b, a.lower < b}; }
 static inline IntRows& operator|=(IntRows& a, IntRows b) { return a = {a.upper | b.upper, a.lower | b.lower}; }
 
 static inline Rows min(Rows a, float b) { return {min(a.upper, splat(b)), min(a.lower, splat(b))}; }
@@ -139,6 +142,12 @@ static inline Rows either(IntRows mask, Rows a, Rows b) {
 }
 
 static inline bool any(IntRows mask) { return any(mask.upper | mask.lower); }
+
+// A sum whose rows are added at once: sums of two registers each would not fit the registers.
+typedef Lanes FoldedRows;
+static inline void add(FoldedRows& sum, Rows a) { sum += a.upper, sum += a.lower; }
+static inline void add_product(FoldedRows& sum, Rows a, Rows b) { sum += a.upper * b.upper, sum += a.lower * b.lower; }
+static inline Lanes folded(FoldedRows sum) { return sum; }
 #endif
 
 static inline Rows keep(IntRows mask, Rows a) { return either(mask, a, Rows{}); }
@@ -151,4 +160,3 @@ static inline Rows rows_of(const MakeRow& row) {
 
 static inline Lanes row_of(Rows rows, int index) { return index == 0 ? upper(rows) : lower(rows); }
 static inline Rows repeated(Lanes row) { return pair(row, row); }
-static inline Lanes folded(Rows rows) { return upper(rows) + lower(rows); }

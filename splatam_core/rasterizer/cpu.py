@@ -191,14 +191,13 @@ class _Splat(torch.autograd.Function):
         ctx: Any, means: Tensor, log_scales: Tensor, logit_opacities: Tensor, rgb: Tensor, T_cam_world: Tensor, given: _Pass
     ) -> tuple[Tensor, Tensor, Tensor]:
         render, ctx.view = given.drawn(means, log_scales, logit_opacities, rgb, T_cam_world)
-        images = render.rgb, render.depth_acc, render.silhouette
         ctx.engine = given.engine
-        ctx.save_for_backward(means, log_scales, logit_opacities, rgb, *images)
-        return images
+        ctx.save_for_backward(means, log_scales, logit_opacities, rgb)
+        return render.rgb, render.depth_acc, render.silhouette
 
     @staticmethod
     def backward(ctx: Any, *image_gradients: Tensor) -> tuple[Tensor | None, ...]:
-        *inputs, rgb_image, depth_acc, silhouette = (tensor.detach() for tensor in ctx.saved_tensors)
+        inputs = [tensor.detach() for tensor in ctx.saved_tensors]
         means, log_scales, logit_opacities, rgb = inputs
         gradients = [
             torch.zeros_like(tensor) if wanted else None for tensor, wanted in zip(inputs, ctx.needs_input_grad, strict=False)
@@ -211,7 +210,6 @@ class _Splat(torch.autograd.Function):
             log_scales=log_scales.numpy(),
             logit_opacities=logit_opacities.numpy(),
             rgb=rgb.numpy(),
-            images=[image.numpy() for image in (rgb_image, depth_acc, silhouette)],
             image_gradients=[gradient.contiguous().numpy() for gradient in image_gradients],
             means_gradient=by_means,
             log_scales_gradient=by_log_scales,

@@ -46,7 +46,7 @@ def forward(**changed: object) -> None:
 def backward(**changed: object) -> None:
     engine, drawn = _native.Engine(1), list(images().values())
     view = engine.forward(**gaussians(), bounds=None, T_cam_world=POSE, camera=CAMERA, **images())
-    arguments = gaussians() | {'images': drawn, 'image_gradients': drawn, 'pose_gradient': floats(4, 4)}
+    arguments = gaussians() | {'image_gradients': drawn, 'pose_gradient': floats(4, 4)}
     arguments |= {f'{name}_gradient': np.zeros_like(values) for name, values in gaussians().items()}
     for name, value in changed.items():
         kind, _, index = name.partition('_at_')
@@ -148,7 +148,7 @@ CALLS = {
     forward: GAUSSIANS | {'bounds': (1, 7), 'image': IMAGE, 'depth': PLANE, 'silhouette': PLANE},
     backward: GAUSSIANS
     | {f'{name}_gradient': shape for name, shape in GAUSSIANS.items()}
-    | {'pose_gradient': (4, 4), 'images_at_0': IMAGE, 'images_at_1': PLANE, 'image_gradients_at_2': PLANE},
+    | {'pose_gradient': (4, 4), 'image_gradients_at_0': IMAGE, 'image_gradients_at_2': PLANE},
     fit: GAUSSIANS | {'bounds': (1, 7), 'moments': (N, 16), 'target_depth': PLANE},
     linearize: {'brightness': PLANE, 'depth': PLANE, 'layers': (HEIGHT, WIDTH, 8), 'velocity': (6,), 'readout': (6,)},
     descend: {'brightness': PLANE, 'depth': PLANE, 'layers': (HEIGHT, WIDTH, 8)},

@@ -158,7 +158,7 @@ def test_memory_of_gradients_does_not_grow_with_threads() -> None:
     )
     before = resident_bytes()
     engine.backward(
-        view, **gaussians, images=images, image_gradients=[np.ones_like(image) for image in images], **gradients,
+        view, **gaussians, image_gradients=[np.ones_like(image) for image in images], **gradients,
         pose_gradient=np.zeros((4, 4), np.float32),
     )  # fmt: skip
     assert gradients['rgb_gradient'][:100].any() and not gradients['rgb_gradient'][100:].any()
