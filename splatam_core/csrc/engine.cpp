@@ -345,7 +345,7 @@ void sum_gradients(View& view, std::size_t block, BlockSums& sums) {
 
 float* Engine::Scratch::for_splats(std::size_t count) {
   constexpr std::size_t kVector = kScratchAlignment / sizeof(float);
-  grow(of_splats, count * kScratchPerSplat + kVector);
+  grow(of_splats, scratch_of(count) + kVector);
   const auto address = reinterpret_cast<std::uintptr_t>(of_splats.data()) / sizeof(float);
   return of_splats.data() + (kVector - address % kVector) % kVector;
 }

@@ -98,8 +98,17 @@ struct AdamRates {
   float means, log_scales, logit_opacities, rgb;
 };
 
-constexpr int kScratchPerSplat = 129;  // floats: alpha and weight in each pixel of a tile, and where it is seen
-constexpr int kScratchAlignment = 64;  // bytes
+// Memory of a tile whose splats are gone through twice, in floats.
+constexpr std::size_t kPart = 2048;            // splats of which everything is kept at once
+constexpr std::size_t kScratchPerSplat = 129;  // alpha and weight in each pixel of a tile, and where it is seen
+constexpr std::size_t kScratchPerPart = 64;    // transmittance in each pixel of a tile
+constexpr std::size_t kScratchAlignment = 64;  // bytes
+
+inline std::size_t parts_of(std::size_t count) { return (count + kPart - 1) / kPart; }
+
+inline std::size_t scratch_of(std::size_t count) {
+  return kScratchPerPart * parts_of(count) + kScratchPerSplat * (count < kPart ? count : kPart);
+}
 
 struct TileList {
   int x, y;  // pixel of its upper left corner
@@ -143,8 +152,8 @@ struct Kernels {
   std::size_t (*project)(const GaussianArrays&, const Camera&, const Pose&, std::size_t begin, std::size_t end,
                          Splat* splats, TileRect* rects, std::uint32_t* ids);
   void (*forward)(const TileList&, const Splat*, const Camera&, const Images&);
-  // Adds to the gradients. Skips those by the colours unless `map` is set. `scratch` is memory of kScratchPerSplat
-  // floats per splat of the list, aligned to kScratchAlignment.
+  // Adds to the gradients. Skips those by the colours unless `map` is set. `scratch` is memory of scratch_of(count
+  // of the list) floats, aligned to kScratchAlignment.
   void (*backward)(const TileList&, const Splat*, const Camera&, const ConstImages& gradient, bool map, float* scratch,
                    SplatGradient* gradients);
   // Blends a tile, compares it with the target (Huber) and adds the gradients. Returns the tile's loss. `scratch` is as

@@ -265,7 +265,8 @@ static inline void for_reached(Group* groups, const Batch& batch, Groups open, c
 // Calls visit(batch, the groups that are open, number of its first splat) for a tile's splats, front to back, until the
 // tile is saturated. Returns how many splats that were. Group is as in open_groups().
 template <typename Group, typename Visit>
-static inline std::size_t for_batches(Group* rows, const TileList& tile, const Splat* splats, const Visit& visit) {
+__attribute__((always_inline)) static inline std::size_t for_batches(Group* rows, const TileList& tile,
+                                                                     const Splat* splats, const Visit& visit) {
   const Corner at = corner(tile);
   Footprint footprints[kBatch];
   Batch batch;
@@ -373,51 +374,116 @@ static inline void fetch(const Splat* splats, SplatGradient* gradients, std::uin
   __builtin_prefetch(gradients + member, 1);
 }
 
-// What the splats of a tile take, front to back.
-struct TakenByAll {
+// The list of a tile, in parts of up to kPart splats: what a part takes is kept, and what the parts before it took is
+// found again from their start. Few tiles have more than one part.
+static inline TileList part_of(const TileList& tile, std::size_t first) {
+  const std::size_t left = tile.count - first;
+  return {tile.x, tile.y, tile.splats + first, left < kPart ? left : kPart};
+}
+
+// What the splats of a part take, front to back.
+struct TakenByPart {
   Taken* of_splats;      // kGroups for each
   std::uint8_t* groups;  // those in which it is seen
   std::size_t count;     // of the splats in front of what saturates the tile
 };
-static_assert(kGroups * sizeof(Taken) + 1 <= kScratchPerSplat * sizeof(float), "scratch is allocated elsewhere");
 
-// Blends a tile. Calls blend(group, raw alpha, values of the splat), which returns what the splat takes.
+struct Transmittance {
+  Rows T;
+};
+
+// What the splats of a tile take.
+struct TakenByAll {
+  Transmittance (*starts)[kGroups];  // of each part
+  std::size_t first;                 // splat of the last part
+  TakenByPart last;
+};
+static_assert(sizeof(Transmittance[kGroups]) <= kScratchPerPart * sizeof(float) &&
+                  kGroups * sizeof(Taken) + 1 <= kScratchPerSplat * sizeof(float) && kPart % kBatch == 0,
+              "scratch is allocated elsewhere");
+
+// Blends a part. Calls blend(group, raw alpha, values of the splat), which returns what the splat takes.
 template <typename Group, typename Blend>
-static inline TakenByAll take_all(Group* rows, const TileList& tile, const Splat* splats, float* scratch,
-                                  const Blend& blend) {
-  TakenByAll all{};
-  all.of_splats = reinterpret_cast<Taken*>(scratch);
-  all.groups = reinterpret_cast<std::uint8_t*>(all.of_splats + kGroups * tile.count);
-  all.count = for_batches(rows, tile, splats, [&](Batch& batch, Groups open, std::size_t first) {
-    find_reached(batch, open, all.groups + first);
-    Taken* taken = all.of_splats + kGroups * first;
+__attribute__((always_inline)) static inline TakenByPart take_part(Group* rows, const TileList& part,
+                                                                   const Splat* splats, Taken* scratch,
+                                                                   const Blend& blend) {
+  TakenByPart to{scratch, reinterpret_cast<std::uint8_t*>(scratch + kGroups * part.count), 0};
+  to.count = for_batches(rows, part, splats, [&](Batch& batch, Groups open, std::size_t first) {
+    find_reached(batch, open, to.groups + first);
+    Taken* taken = to.of_splats + kGroups * first;
     for_reached(rows, batch, open, [&](Group& group, int i, int k) {
       taken[kGroups * k + i] = blend(group, raw_alpha(batch.footprints[k], i), batch.values[k]);
     });
   });
+  return to;
+}
+
+// Blends a tile of more than one part. Not inlined, because such tiles are rare.
+template <typename Group, typename Blend>
+__attribute__((noinline)) static TakenByAll take_parts(Group* rows, const TileList& tile, const Splat* splats,
+                                                       float* scratch, const Blend& blend) {
+  TakenByAll all{reinterpret_cast<Transmittance(*)[kGroups]>(scratch), 0, {}};
+  Taken* taken = reinterpret_cast<Taken*>(scratch + kScratchPerPart * parts_of(tile.count));
+  for (std::size_t first = 0; first < tile.count; first += kPart) {
+    for (int i = 0; i < kGroups; ++i) all.starts[first / kPart][i].T = rows[i].T;
+    const TileList part = part_of(tile, first);
+    all.first = first;
+    all.last = take_part(rows, part, splats, taken, blend);
+    if (all.last.count < part.count) break;
+  }
   return all;
 }
 
-// The backward pass of a tile: adds to the gradients.
+// Blends a tile, as take_part() a part.
+template <typename Group, typename Blend>
+static inline TakenByAll take_all(Group* rows, const TileList& tile, const Splat* splats, float* scratch,
+                                  const Blend& blend) {
+  if (tile.count > kPart) return take_parts(rows, tile, splats, scratch, blend);
+  return {nullptr, 0, take_part(rows, tile, splats, reinterpret_cast<Taken*>(scratch), blend)};
+}
+
+// The backward pass of a part of a tile: adds to the gradients.
+template <bool kMap, bool kSilhouette>
+__attribute__((always_inline)) static inline void blend_back(PixelGradients* rows, const TileList& part,
+                                                             const Splat* splats, const TakenByPart& taken,
+                                                             SplatGradient* gradients) {
+  const Corner at = corner(part);
+  const RowNumbers numbers;
+  for (std::size_t k = taken.count; k-- > 0;) {
+    if (k >= kAhead) fetch(splats, gradients, part.splats[k - kAhead]);
+    const std::uint32_t member = part.splats[k];
+    blend_back<kMap, kSilhouette>(rows, splats[member], at, taken.of_splats + kGroups * k, numbers, taken.groups[k],
+                                  gradients[member]);
+  }
+}
+
+// The backward pass of a tile of more than one part. Not inlined, as take_parts().
+template <bool kMap, bool kSilhouette>
+__attribute__((noinline)) static void blend_back_parts(PixelGradients* rows, const TileList& tile, const Splat* splats,
+                                                       const TakenByAll& all, SplatGradient* gradients) {
+  TakenByPart taken = all.last;
+  for (std::size_t first = all.first;; first -= kPart) {
+    const TileList part = part_of(tile, first);
+    if (first < all.first)
+      taken = take_part(all.starts[first / kPart], part, splats, taken.of_splats,
+                        [](Transmittance& rows, Rows raw_alpha, const Values&) { return take(rows.T, raw_alpha); });
+    blend_back<kMap, kSilhouette>(rows, part, splats, taken, gradients);
+    if (first == 0) return;
+  }
+}
+
+// The backward pass of a tile.
 template <bool kMap, bool kSilhouette>
 static inline void blend_back(PixelGradients* rows, const TileList& tile, const Splat* splats, const TakenByAll& all,
                               SplatGradient* gradients) {
-  const Corner at = corner(tile);
-  const RowNumbers numbers;
-  for (std::size_t k = all.count; k-- > 0;) {
-    if (k >= kAhead) fetch(splats, gradients, tile.splats[k - kAhead]);
-    const std::uint32_t member = tile.splats[k];
-    blend_back<kMap, kSilhouette>(rows, splats[member], at, all.of_splats + kGroups * k, numbers, all.groups[k],
-                                  gradients[member]);
-  }
+  if (tile.count > kPart) return blend_back_parts<kMap, kSilhouette>(rows, tile, splats, all, gradients);
+  blend_back<kMap, kSilhouette>(rows, tile, splats, all.last, gradients);
 }
 
 template <bool kMap>
 static inline void backward_tile(const TileList& tile, const Splat* splats, const Camera& camera,
                                  const ConstImages& gradient, float* scratch, SplatGradient* gradients) {
-  struct Transmittance {
-    Rows T;
-  } transmittances[kGroups];
+  Transmittance transmittances[kGroups];
   for (int i = 0; i < kGroups; ++i) transmittances[i].T = first_transmittance(tile, camera, kRows * i);
   const TakenByAll all =
       take_all(transmittances, tile, splats, scratch,

@@ -48,6 +48,7 @@ SCENES = {
     'smaller than a tile': scenes.random_scene(3, 40, 5, 3),
     'one pixel': scenes.random_scene(3, 40, 1, 1),
     'many, deep': scenes.random_scene(4, 3000, 33, 25),
+    'thousands in a tile': scenes.random_scene(10, 6000, 8, 8, sigma_px=0.5, logit=-4.0),  # three parts of kPart (kernels.hpp)
     'behind the camera': _behind(5),
     'empty': _none(),
     'huge': scenes.random_scene(6, 60, 50, 37, sigma_px=60.0),
@@ -67,7 +68,17 @@ SCENES = {
     'small, opaque': scenes.random_scene(45, 120, 26, 19, logit=6.0),
 }
 INTERPRETED = ('small', 'smaller than a tile', 'one pixel', 'empty', 'at the left border', 'at the near plane')
-FITTED = ('random', 'odd size', 'smaller than a tile', 'many, deep', 'behind the camera', 'empty', 'opaque', 'small, opaque')
+FITTED = (
+    'random',
+    'odd size',
+    'smaller than a tile',
+    'many, deep',
+    'thousands in a tile',
+    'behind the camera',
+    'empty',
+    'opaque',
+    'small, opaque',
+)
 
 
 def _cases(names: Iterable[str]) -> list[tuple[str, str, int]]:
@@ -99,7 +110,9 @@ def _assert_equals_reference(rasterizer: Rasterizer, scene: Scene, device: str =
         assert _relative_error(gradients[parameter], gradient) < GRADIENT_TOLERANCE, parameter
 
 
-@pytest.mark.parametrize('name', ['odd size', 'smaller than a tile', 'many, deep', 'behind the camera', 'opaque', 'huge', 'tiny'])
+@pytest.mark.parametrize(
+    'name', ['odd size', 'smaller than a tile', 'many, deep', 'thousands in a tile', 'behind the camera', 'opaque', 'huge', 'tiny']
+)
 @pytest.mark.parametrize('isa', ['generic', 'avx2', 'avx512'])
 def test_every_instruction_set_equals_reference(isa: str, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the processor has it: the run-time choice must not change image, gradients, fit or update.
