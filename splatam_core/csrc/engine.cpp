@@ -13,8 +13,8 @@
 namespace splatam {
 namespace {
 
-constexpr int kDigitBits = 10, kDigitsOfDepth = 3;  // hold every depth from 0.2 m on
-constexpr std::size_t kDigits = std::size_t(1) << kDigitBits;
+constexpr int kDigitBits = 11;
+constexpr std::uint32_t kDigits = 1u << kDigitBits;
 
 std::size_t blocks_of(std::size_t count) { return (count + kBlock - 1) / kBlock; }
 
@@ -68,25 +68,58 @@ void grow(std::vector<T>& values, std::size_t count) {
   if (values.size() < count) values.resize(count);
 }
 
-// Sorts by depth, in place or into `sorted`; returns which. Those of equal depth keep their order, which is that of the
-// lower half of a key.
-const std::uint64_t* sorted_by_depth(std::uint64_t* keys, std::uint64_t* sorted, std::size_t count) {
-  constexpr std::size_t kFew = 256;  // a radix sort has to clear its counters
-  if (count < kFew) {
-    std::sort(keys, keys + count);
-    return keys;
-  }
-  std::uint32_t places[kDigitsOfDepth][kDigits] = {};
-  const auto digit = [](std::uint64_t key, int index) { return key >> (32 + kDigitBits * index) & (kDigits - 1); };
+// The depths of the members that are sorted, as depth_bits().
+struct DepthRange {
+  std::uint32_t lowest = ~std::uint32_t(0), highest = 0;
+};
+
+// Sorts by two digits of the depth, counted from the lowest bit of its difference to the lowest depth that counts.
+// Returns where the sorted keys are.
+std::uint64_t* sorted_by_digits(std::uint64_t* keys, std::uint64_t* sorted, std::size_t count, std::uint32_t lowest,
+                                int shift) {
+  std::uint32_t places[2][kDigits] = {};
+  const auto digit = [&](std::uint64_t key, int index) {
+    return (std::uint32_t(key >> 32) - lowest) >> (shift + kDigitBits * index) & (kDigits - 1);
+  };
   for (std::size_t i = 0; i < count; ++i)
-    for (int index = 0; index < kDigitsOfDepth; ++index) ++places[index][digit(keys[i], index)];
-  for (int index = 0; index < kDigitsOfDepth; ++index) {  // the lowest digit first
+    for (int index = 0; index < 2; ++index) ++places[index][digit(keys[i], index)];
+  for (int index = 0; index < 2; ++index) {  // the lower digit first
     std::uint32_t place = 0;
     for (std::uint32_t& next : places[index]) place += std::exchange(next, place);
     for (std::size_t i = 0; i < count; ++i) sorted[places[index][digit(keys[i], index)]++] = keys[i];
     std::swap(keys, sorted);
   }
   return keys;
+}
+
+// Puts keys in order that are nearly so. Returns false, and may leave them in another order, if too many are not.
+bool put_in_order(std::uint64_t* keys, std::size_t count) {
+  std::size_t moves = 0;
+  for (std::size_t i = 1; i < count; ++i) {
+    const std::uint64_t key = keys[i];
+    if (keys[i - 1] < key) continue;
+    std::size_t at = i;
+    for (; at > 0 && keys[at - 1] > key; --at) keys[at] = keys[at - 1];
+    keys[at] = key;
+    moves += i - at;
+    if (moves > count) return false;
+  }
+  return true;
+}
+
+// Sorts by depth, in place or into `sorted`; returns which. Those of equal depth keep their order, which is that of the
+// lower half of a key.
+const std::uint64_t* sorted_by_depth(std::uint64_t* keys, std::uint64_t* sorted, std::size_t count, DepthRange range) {
+  constexpr std::size_t kFew = 256;  // a radix sort has to clear its counters
+  if (count < kFew) {
+    std::sort(keys, keys + count);
+    return keys;
+  }
+  int shift = 0;  // the lowest bits of a depth rarely decide
+  while ((range.highest - range.lowest) >> shift >= kDigits * kDigits) ++shift;
+  std::uint64_t* order = sorted_by_digits(keys, sorted, count, range.lowest, shift);
+  if (shift > 0 && !put_in_order(order, count)) std::sort(order, order + count);
+  return order;
 }
 
 // Lists a row's members tile by tile, front to back.
@@ -96,27 +129,37 @@ void list_tiles(View& view, int row, std::vector<std::uint64_t>& keys, std::vect
   grow(sorted, count);
   std::size_t *begins = view.tile_begins.data() + std::size_t(row) * view.tiles_x,
               *ends = view.tile_ends.data() + std::size_t(row) * view.tiles_x;
-  // Counts where the members begin, and where they have ended, rather than all tiles between.
-  std::fill_n(begins, view.tiles_x, 0);
-  std::fill_n(ends, view.tiles_x, 0);
+  // Counts where the members begin, and after which tile they end, rather than all tiles between.
+  std::uint32_t begun[kMaxTiles], ended[kMaxTiles + 1];
+  std::fill_n(begun, view.tiles_x, 0);
+  std::fill_n(ended, view.tiles_x + 1, 0);
   const Columns* columns = view.columns.data() + first;
+  DepthRange range;
   for (std::size_t i = 0; i < count; ++i) {
-    keys[i] = std::uint64_t(depth_bits(view.members[first + i].z)) << 32 | i;
-    ++begins[columns[i].first];
-    if (columns[i].last + 1 < view.tiles_x) ++ends[columns[i].last + 1];
+    const std::uint32_t depth = depth_bits(view.members[first + i].z);
+    range.lowest = std::min(range.lowest, depth), range.highest = std::max(range.highest, depth);
+    keys[i] = std::uint64_t(depth) << 32 | i;
+    ++begun[columns[i].first];
+    ++ended[columns[i].last + 1];
   }
   std::size_t place = view.entry_begins[row], open = 0;
   for (int x = 0; x < view.tiles_x; ++x) {
-    open += begins[x] - ends[x];
+    open += begun[x];
+    open -= ended[x];
     begins[x] = ends[x] = place;
     place += open;
   }
-  const std::uint64_t* order = sorted_by_depth(keys.data(), sorted.data(), count);
+  const std::uint64_t* order = sorted_by_depth(keys.data(), sorted.data(), count, range);
   std::uint32_t* entries = view.entries.data();
   for (std::size_t i = 0; i < count; ++i) {
     const std::uint32_t member = std::uint32_t(order[i]);
     const Columns touched = columns[member];
-    for (int x = touched.first; x <= touched.last; ++x) entries[ends[x]++] = member;
+    if (touched.first > touched.last) continue;
+    entries[ends[touched.first]++] = member;  // no branch: whether a member ends where it begins cannot be foretold
+    for (int x = touched.first + 1; x < touched.last; ++x) entries[ends[x]++] = member;
+    const std::size_t at = ends[touched.last] - (touched.first == touched.last);
+    entries[at] = member;
+    ends[touched.last] = at + 1;
   }
 }
 

@@ -1,22 +1,23 @@
 // Included once per instruction set, inside a namespace and a target region, after projection.inl and lanes.inl.
 
-static inline bool is_usable(float x) {  // false for NaN
-  std::uint32_t magnitude, limit;
-  __builtin_memcpy(&magnitude, &x, sizeof x);
-  __builtin_memcpy(&limit, &kHuge, sizeof limit);
-  return (magnitude & 0x7fffffff) < limit;
+// Loads up to eight times three values: a lane each, three vectors. The lanes beyond are zero.
+static inline void load_triples(const float* from, int count, Lanes* to) {
+  if (count == 8) return load_triples(from, to);
+  float values[24] = {};
+  for (int i = 0; i < 3 * count; ++i) values[i] = from[i];
+  load_triples(values, to);
 }
 
 static inline Lanes clamp(Lanes x, float low, float high) { return min(max(x, splat(low)), splat(high)); }
 
-// The fields of eight TileRects; missed_corners counts only where the rect is more than one tile wide and high.
+// Eight TileRects, each as two numbers.
 struct TileRects {
-  std::int32_t x0[8], y0[8], x1[8], y1[8], missed_corners[8];
+  static_assert(sizeof(TileRect) == 8 && __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "of 16 bits, the lower first");
+  std::int32_t first[8], last[8];
   TileRect operator[](int i) const {
+    const std::int32_t both[2] = {first[i], last[i]};
     TileRect rect;
-    rect.x0 = std::uint16_t(x0[i]), rect.y0 = std::uint16_t(y0[i]);
-    rect.x1 = std::uint16_t(x1[i]), rect.y1 = std::uint16_t(y1[i]);
-    rect.missed_corners = std::uint16_t(x0[i] == x1[i] || y0[i] == y1[i] ? 0 : missed_corners[i]);
+    __builtin_memcpy(&rect, both, sizeof rect);
     return rect;
   }
 };
@@ -36,8 +37,9 @@ static inline TileRects touched_tiles(Lanes u, Lanes v, Lanes extent, const Came
   const IntLanes missed = ((left * left + above * above > limit) & 1) | ((past * past + above * above > limit) & 2) |
                           ((left * left + below * below > limit) & 4) | ((past * past + below * below > limit) & 8);
   TileRects rects;
-  store(rects.x0, x0), store(rects.y0, y0), store(rects.x1, x1), store(rects.y1, y1);
-  store(rects.missed_corners, missed);
+  const IntLanes counts = (x0 < x1) & (y0 < y1);  // else a missed corner would be all of a row
+  store(rects.first, x0 | (y0 << 16));
+  store(rects.last, x1 | (y1 << 16) | ((missed & counts) << 28));
   return rects;
 }
 
@@ -47,10 +49,9 @@ static std::size_t project(const GaussianArrays& gaussians, const Camera& camera
   const float focal = camera.focal();
   for (std::size_t first = begin; first < end; first += 8) {
     const int count = end - first < 8 ? int(end - first) : 8;
-    float means[3][8] = {};
-    for (int i = 0; i < count; ++i)
-      for (int axis = 0; axis < 3; ++axis) means[axis][i] = gaussians.means[3 * (first + i) + axis];
-    const Lanes x = load(means[0]), y = load(means[1]), z = load(means[2]);
+    Lanes means[3], rgb[3];
+    load_triples(gaussians.means + 3 * first, count, means);
+    const Lanes x = means[0], y = means[1], z = means[2];
     const Lanes log_scale = load_some(gaussians.log_scales + first, count, Lanes{});
     const Lanes logit = load_some(gaussians.logit_opacities + first, count, Lanes{});
     const float *R = pose.R, *t = pose.t;
@@ -65,24 +66,21 @@ static std::size_t project(const GaussianArrays& gaussians, const Camera& camera
     const Lanes opacity = 1.0f / (1.0f + exp(min(-logit, splat(80.0f))));
     const Lanes extent = sqrt(max(2.0f * variance * log_bound(255.0f * opacity), Lanes{}));
     // Comparisons with NaN are false, so that what is not finite is not drawn.
-    const IntLanes drawn = (cam_z > kNear) & (cam_z < kHuge) & (absolute(log_scale) < kHuge) &
-                           (absolute(logit) < kHuge) & (opacity >= kMinAlpha) & (u + extent >= 0.0f) &
-                           (u - extent <= float(camera.width - 1)) & (v + extent >= 0.0f) &
-                           (v - extent <= float(camera.height - 1));
+    IntLanes drawn = (cam_z > kNear) & (cam_z < kHuge) & (absolute(log_scale) < kHuge) & (absolute(logit) < kHuge) &
+                     (opacity >= kMinAlpha) & (u + extent >= 0.0f) & (u - extent <= float(camera.width - 1)) &
+                     (v + extent >= 0.0f) & (v - extent <= float(camera.height - 1));
     if (!any(drawn)) continue;
+    load_triples(gaussians.rgb + 3 * first, count, rgb);
+    for (int channel = 0; channel < 3; ++channel) drawn &= absolute(rgb[channel]) < kHuge;
     const TileRects touched = touched_tiles(u, v, extent, camera);
-    std::int32_t is_drawn[8];
-    float us[8], vs[8], falloffs[8], opacities[8], depths[8];
-    store(is_drawn, drawn);
-    store(us, u), store(vs, v), store(falloffs, -0.5f / variance), store(opacities, opacity), store(depths, cam_z);
-    for (int i = 0; i < count; ++i) {
-      if (!is_drawn[i]) continue;
-      const float* rgb = gaussians.rgb + 3 * (first + i);
-      if (!(is_usable(rgb[0]) && is_usable(rgb[1]) && is_usable(rgb[2]))) continue;
-      splats[visible] = {us[i], vs[i], falloffs[i], opacities[i], rgb[0], rgb[1], rgb[2], depths[i]};
+    Lanes rows[8] = {u, v, -0.5f / variance, opacity, rgb[0], rgb[1], rgb[2], cam_z};  // as in Splat
+    transpose(rows);
+    const unsigned is_drawn = bits_of_mask(drawn);
+    for (int i = 0; i < count; ++i) {  // what is not drawn is overwritten: a branch for each would cost more
+      store(&splats[visible].u, rows[i]);
       rects[visible] = touched[i];
       ids[visible] = std::uint32_t(first + i);
-      ++visible;
+      visible += is_drawn >> i & 1;
     }
   }
   return visible - begin;
@@ -602,13 +600,13 @@ static double fit(const TileList& tile, const Splat* splats, const Camera& camer
 
 constexpr float kBeta1 = 0.9f, kBeta2 = 0.9f, kEpsilon = 1e-15f;
 
-// Adam's bias corrections, by the number of steps; of the first moment as it is one step ahead.
+// The inverse of Adam's bias corrections, by the number of steps; of the first moment as it is one step ahead.
 struct BiasCorrections {
   float first[256], second[256];
   constexpr BiasCorrections() : first(), second() {
     float left1 = kBeta1, left2 = 1.0f;
     for (int i = 0; i < 256; ++i) {
-      first[i] = 1.0f - left1, second[i] = 1.0f - left2;
+      first[i] = 1.0f / (1.0f - left1), second[i] = i == 0 ? 0.0f : 1.0f / (1.0f - left2);  // there is no step 0
       left1 *= kBeta1, left2 *= kBeta2;
     }
   }
@@ -646,8 +644,8 @@ static inline void adam_step(std::size_t id, Lanes gradient, Lanes rate, const M
   const Lanes first = kBeta1 * load(moments) + (1.0f - kBeta1) * gradient;
   const Lanes second = kBeta2 * load(moments + 8) + (1.0f - kBeta2) * gradient * gradient;
   const int step = adam.steps[id] < 255 ? adam.steps[id] + 1 : 255;
-  const Lanes ahead = (kBeta1 * first + (1.0f - kBeta1) * gradient) / kBiasCorrections.first[step];
-  const Lanes move = rate * ahead / (sqrt(second / kBiasCorrections.second[step]) + kEpsilon);
+  const Lanes ahead = (kBeta1 * first + (1.0f - kBeta1) * gradient) * kBiasCorrections.first[step];
+  const Lanes move = rate * ahead / (sqrt(second * kBiasCorrections.second[step]) + kEpsilon);
   const IntLanes usable = (absolute(first) < kHuge) & (second < kHuge) & (absolute(move) < kHuge);
   if (bits_of_mask(usable) != 0xff) return;  // an overflow would stay in the moments for ever
   store(moments, first);

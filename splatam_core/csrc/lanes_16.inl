@@ -145,6 +145,23 @@ static inline void transpose(Lanes* rows) {
     rows[i] = {quarters[0][i], quarters[2][i]}, rows[4 + i] = {quarters[1][i], quarters[3][i]};
 }
 
+static inline void load_triples(const float* from, Half* to) {
+  Half a, b, c;
+  __builtin_memcpy(&a, from, sizeof a);
+  __builtin_memcpy(&b, from + 4, sizeof b);
+  __builtin_memcpy(&c, from + 8, sizeof c);
+  to[0] = __builtin_shufflevector(__builtin_shufflevector(a, b, 0, 3, 6, 6), c, 0, 1, 2, 5);
+  to[1] = __builtin_shufflevector(__builtin_shufflevector(a, b, 1, 4, 7, 7), c, 0, 1, 2, 6);
+  to[2] = __builtin_shufflevector(__builtin_shufflevector(a, b, 2, 5, 5, 5), c, 0, 1, 4, 7);
+}
+
+// Loads eight times three values: lane i of to[k] is from[3 * i + k].
+static inline void load_triples(const float* from, Lanes* to) {
+  Half low[3], high[3];
+  load_triples(from, low), load_triples(from + 12, high);
+  for (int i = 0; i < 3; ++i) to[i] = {low[i], high[i]};
+}
+
 // Lane i of the result is the sum of the lanes of rows[i].
 static inline Half row_sums(Half* rows) {
 #if defined(__aarch64__)

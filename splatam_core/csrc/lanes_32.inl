@@ -59,6 +59,23 @@ static inline void transpose(Lanes* rows) {
   }
 }
 
+// Loads eight times three values: lane i of to[k] is from[3 * i + k].
+static inline void load_triples(const float* from, Lanes* to) {
+  Lanes a, b, c;
+  __builtin_memcpy(&a, from, sizeof a);
+  __builtin_memcpy(&b, from + 8, sizeof b);
+  __builtin_memcpy(&c, from + 16, sizeof c);
+  const Lanes x =
+      __builtin_shufflevector(__builtin_shufflevector(a, b, 0, 9, 2, 3, 12, 5, 6, 15), c, 0, 1, 10, 3, 4, 13, 6, 7);
+  const Lanes y =
+      __builtin_shufflevector(__builtin_shufflevector(a, b, 0, 1, 10, 3, 4, 13, 6, 7), c, 8, 1, 2, 11, 4, 5, 14, 7);
+  const Lanes z =
+      __builtin_shufflevector(__builtin_shufflevector(a, b, 8, 1, 2, 11, 4, 5, 14, 7), c, 0, 9, 2, 3, 12, 5, 6, 15);
+  to[0] = __builtin_shufflevector(x, x, 0, 3, 6, 1, 4, 7, 2, 5);
+  to[1] = __builtin_shufflevector(y, y, 1, 4, 7, 2, 5, 0, 3, 6);
+  to[2] = __builtin_shufflevector(z, z, 2, 5, 0, 3, 6, 1, 4, 7);
+}
+
 // Lane i of the result is the sum of the lanes of rows[i].
 static inline Lanes row_sums(const Lanes* rows) {
   Lanes a[4], b[2];

@@ -38,6 +38,17 @@ def _behind(seed: int) -> Scene:
     )  # fmt: skip
 
 
+def _nearly_equal_depths() -> Scene:
+    """A wall seen head-on, with depths that differ in the lowest bits alone, and one Gaussian far away."""
+    scene = scenes.random_scene(10, 700, 37, 8)
+    wall = scene.gaussians.means.clone()
+    wall *= 2.0 / wall[:, 2:]
+    wall[:, 2] += torch.randperm(len(wall), generator=torch.Generator().manual_seed(10)) * 2.0**-22
+    wall[-1] *= 1e6
+    gaussians = Gaussians(wall, scene.gaussians.log_scales, scene.gaussians.logit_opacities - 1.0, scene.gaussians.rgb)
+    return Scene(gaussians, scene.camera, torch.eye(4, dtype=torch.float64))
+
+
 def _none() -> Scene:
     return scenes.random_scene(0, 0, 21, 13)
 
@@ -50,6 +61,7 @@ SCENES = {
     'many, deep': scenes.random_scene(4, 3000, 33, 25),
     'thousands in a tile': scenes.random_scene(10, 6000, 8, 8, sigma_px=0.5, logit=-4.0),  # three parts of kPart (kernels.hpp)
     'behind the camera': _behind(5),
+    'nearly equal depths': _nearly_equal_depths(),
     'empty': _none(),
     'huge': scenes.random_scene(6, 60, 50, 37, sigma_px=60.0),
     'tiny': scenes.random_scene(7, 400, 50, 37, sigma_px=0.01),
