@@ -21,6 +21,9 @@ MotionPrior = Callable[[int, int], 'Matrix | None']
 MAX_EXTRAPOLATION = 5
 """A velocity is extrapolated for at most this many times the interval it was observed over: longer gaps say nothing."""
 
+MAX_INTERVALS = 10**6
+"""More frame intervals than this since the last pose, nine hours at 30 Hz, count as this many: of a clock that was set, or after
+two stamps a nanosecond apart, there are more than native code counts."""
 
 MAX_ACCELERATION, MAX_ANGULAR_ACCELERATION = 10.0, 60.0  # m/s^2, rad/s^2: a jerk of the hand
 
@@ -188,7 +191,7 @@ class MotionModel:
 
     def _num_frames(self, elapsed_ns: int) -> int:
         """Returns how many frame intervals a time is, by the last one over which a velocity was observed."""
-        return max(1, round(elapsed_ns / self._interval_ns)) if self._interval_ns else 1
+        return min(max(1, round(elapsed_ns / self._interval_ns)), MAX_INTERVALS) if self._interval_ns else 1
 
     def predict(self, stamp_ns: int) -> Matrix:
         """Returns the predicted pose [4, 4], camera to world, at a stamp."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -135,41 +136,51 @@ def test_frames_without_depth_are_lost_and_do_not_start_a_map(room: tuple[list[R
     assert 'no pixel has a usable depth reading' in slam.process(later).reason
 
 
+Leap = tuple[RgbdFrame, RgbdFrame, np.ndarray]
+
+
 @pytest.fixture(scope='module')
-def leap() -> tuple[RgbdFrame, RgbdFrame, np.ndarray]:
-    """Two frames a second apart, and how the camera moved between: 0.27 m and 18 degrees, a third of the view."""
-    sequence = open_sequence('synthetic', width=320, max_frames=31)
+def leaps() -> list[Leap]:
+    """Frames a second apart, and how the camera moved between: 0.27 m and 18 degrees, a third of the view.
+
+    Of the matches, 40 % agree with the truth, so 300 rounds of five of them miss one leap in ten: a test asks for most of three.
+    """
+    sequence = open_sequence('synthetic', width=320, max_frames=231)
     truth = sequence.ground_truth().T_world_cam
-    return sequence[0], sequence[30], se3.inverse(truth[0]) @ truth[30]
+    return [(sequence[at], sequence[at + 30], se3.inverse(truth[at]) @ truth[at + 30]) for at in (0, 100, 200)]
 
 
 @pytest.mark.parametrize('preset', ['quick', 'realtime'])
-def test_a_leap_is_found_by_features(preset: str, leap: tuple[RgbdFrame, RgbdFrame, np.ndarray]) -> None:
+def test_a_leap_is_found_by_features(preset: str, leaps: list[Leap]) -> None:
     """Alignment alone ends in a false minimum, half a metre off; from there a pixel, at 2.5 m, is 1 cm."""
-    errors_m = {}
-    for features in (True, False):
+
+    def error_m(leap: Leap, features: bool) -> float:
         slam = Slam(load_config(preset, ['threads=1', f'tracking.align.features={features}'.lower()]))
         slam.process(leap[0])
         T_world_cam = slam.process(leap[1]).T_world_cam
-        errors_m[features] = np.linalg.norm((se3.inverse(leap[2]) @ T_world_cam)[:3, 3])
-    assert errors_m[True] < 0.01 and errors_m[False] > 0.1
+        return float(np.linalg.norm((se3.inverse(leap[2]) @ T_world_cam)[:3, 3]))
+
+    assert np.median([error_m(leap, features=True) for leap in leaps]) < 0.01
+    assert np.median([error_m(leap, features=False) for leap in leaps]) > 0.1
 
 
-def test_features_tell_a_pose_or_nothing(leap: tuple[RgbdFrame, RgbdFrame, np.ndarray]) -> None:
+def test_features_tell_a_pose_or_nothing(leaps: list[Leap]) -> None:
     """Within the few pixels from which alignment goes on; of a frame, or a map, that shows nothing there is none."""
-    slam = Slam(load_config('realtime', ['threads=1']))
-    slam.process(leap[0])
-    view = View.from_frame(leap[1], slam.config.depth)
+    errors_m = []
+    for first, second, motion in leaps:
+        slam = Slam(load_config('realtime', ['threads=1']))
+        slam.process(first)
+        view = View.from_frame(second, slam.config.depth)
+        with torch.no_grad():
+            render = make_rasterizer('cpu', 1).render(slam.map.gaussians, view.camera, torch.eye(4))
+        found = pose_by_features(render, view.camera, features_of(view))
+        errors_m.append(math.inf if found is None else np.linalg.norm((found @ motion)[:3, 3]))
+    assert np.median(errors_m) < 0.1  # 1 to 7 cm, from second frame to second frame
     with torch.no_grad():
-        render = make_rasterizer('cpu', 1).render(slam.map.gaussians, view.camera, torch.eye(4))
         nothing = make_rasterizer('cpu', 1).render(slam.map.gaussians, view.camera, torch.diag(torch.tensor([-1.0, 1, -1, 1])))
-    found = pose_by_features(render, view.camera, features_of(view))
-    assert np.linalg.norm((found @ leap[2])[:3, 3]) < 0.1  # 1 to 7 cm, from second frame to second frame
     blank = dataclasses.replace(view, rgb8=torch.full_like(view.rgb8, 99))
-    assert (
-        pose_by_features(render, blank.camera, features_of(blank)) is None
-        and pose_by_features(nothing, view.camera, features_of(view)) is None
-    )
+    assert pose_by_features(render, blank.camera, features_of(blank)) is None
+    assert pose_by_features(nothing, view.camera, features_of(view)) is None
 
 
 def test_a_view_of_somewhere_else_is_lost(room: tuple[list[RgbdFrame], list[np.ndarray]]) -> None:
@@ -592,6 +603,19 @@ def test_at_rest_the_next_frame_may_have_any_stamp(room: tuple[list[RgbdFrame], 
     assert result.status is Status.TRACKED
     assert np.linalg.norm(result.T_world_cam[:3, 3] - truth[3][:3, 3]) < 0.015
     assert slam.process(dataclasses.replace(frames[3], stamp_ns=10**8)).status is Status.TRACKED
+
+
+@pytest.mark.parametrize('interval_ns', [1, 33_000_000])
+@pytest.mark.parametrize('preset', ['realtime', 'quick'])
+def test_a_clock_that_is_set_costs_no_frame(room: tuple[list[RgbdFrame], list[np.ndarray]], preset: str, interval_ns: int) -> None:
+    """A computer without a battery starts in 1970. That many intervals between two frames used to fit into no int of C++."""
+    frames, _ = room
+    slam = Slam(load_config(preset, ['threads=1']))
+    stamps_ns = [10**9, 10**9 + interval_ns, 56 * 365 * 86400 * 10**9]
+    for stamp_ns in (*stamps_ns, stamps_ns[-1] + 33_000_000):
+        result = slam.process(dataclasses.replace(frames[0], stamp_ns=stamp_ns))
+        assert result.status is not Status.LOST
+    assert np.linalg.norm(result.T_world_cam[:3, 3]) < 0.02  # images of 64 pixels tell the position to a centimetre
 
 
 def test_a_camera_that_was_placed_is_at_rest() -> None:
