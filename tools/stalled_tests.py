@@ -12,8 +12,8 @@ import random
 import signal
 import subprocess
 import sys
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 NUM_AT_ONCE = 3  # processes that may be stopped at the same time
@@ -41,14 +41,16 @@ def is_stoppable(pid: int) -> bool:
         return False
 
 
-def stall(run: subprocess.Popen[bytes], rng: random.Random, num_stalls: list[int]) -> None:
-    """Stops processes of a run, one at a time, until it has ended."""
+def stall(run: subprocess.Popen[bytes], rng: random.Random) -> int:
+    """Stops processes of a run, one at a time, until it has ended. Returns how many times."""
+    num_stalls = 0
     while run.poll() is None:
         stoppable = [pid for pid in descendants(run.pid) if is_stoppable(pid)]
         if stoppable:
             stall_one(rng.choice(stoppable), rng.uniform(*STOPPED_S))
-            num_stalls.append(1)
+            num_stalls += 1
         time.sleep(rng.uniform(*RUNNING_S))
+    return num_stalls
 
 
 def stall_one(pid: int, seconds: float) -> None:
@@ -64,14 +66,10 @@ def stall_one(pid: int, seconds: float) -> None:
 def main(arguments: list[str]) -> int:
     """Run pytest with arguments; returns its exit code."""
     run = subprocess.Popen([sys.executable, '-m', 'pytest', *arguments])
-    num_stalls: list[int] = []
     seed = time.time_ns()
-    stallers = [threading.Thread(target=stall, args=(run, random.Random(seed + k), num_stalls)) for k in range(NUM_AT_ONCE)]
-    for staller in stallers:
-        staller.start()
-    for staller in stallers:
-        staller.join()
-    print(f'processes were put aside {len(num_stalls)} times, for {sum(STOPPED_S) / 2:g} s on average')
+    with ThreadPoolExecutor(NUM_AT_ONCE) as executor:
+        num_stalls = sum(executor.map(lambda index: stall(run, random.Random(seed + index)), range(NUM_AT_ONCE)))
+    print(f'processes were put aside {num_stalls} times, for {sum(STOPPED_S) / 2:g} s on average')
     return run.wait()
 
 

@@ -24,7 +24,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import String
-from test_player import DEPTH, INFO, LATCHED, RGB, assert_complaints, complaint, finish, recorded, stamp_ns, subscribe
+from test_player import DEPTH, INFO, LATCHED, RGB, assert_complaints, clock_ns, complaint, finish, recorded, stamp_ns, subscribe
 
 from splatam_core.resources import config_dir
 from splatam_ros.player.main import _count, _positive, _rate, _seconds, make_parser
@@ -199,10 +199,6 @@ def test_static_transforms_are_latched_whatever_was_recorded(graph: Graph, tmp_p
 
 
 # --- /clock ---
-
-
-def clock_ns(clock: Sequence[Clock]) -> list[int]:
-    return [message.clock.sec * 10**9 + message.clock.nanosec for message in clock]
 
 
 def test_the_clock_follows_chosen_topics(graph: Graph, bag: Path) -> None:
