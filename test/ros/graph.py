@@ -59,10 +59,10 @@ class Graph:
     def play(self, *arguments: str, stdin: int = subprocess.DEVNULL) -> Process:
         return self.start('-m', 'splatam_ros.player.main', *arguments, stdin=stdin)
 
-    def play_in_step(self, *arguments: str) -> Process:
+    def play_in_step(self, *arguments: str, processed: str = '/splatam/processed') -> Process:
         """Start a player that waits for the node and for this test, which hears all that is published even if it is put aside."""
         heard = self.publisher(Header, '/heard')
-        self.node.create_subscription(Header, '/splatam/processed', heard.publish, RELIABLE)
+        self.node.create_subscription(Header, processed, heard.publish, RELIABLE)
         return self.play(*arguments, '--rate', 'max', '--wait-for', '/heard')
 
     def run_node(self, *ros_arguments: str, **parameters: Any) -> Process:

@@ -186,10 +186,9 @@ def test_a_recorded_extrinsic_arrives_though_playback_starts_later(
         camera_frame=CAMERA_FRAME,
     )  # fmt: skip
     graph.spin_until(lambda: graph.node.count_publishers('/robot/splatam/odometry'), explain=lambda: node.text)
-    player = graph.play(
+    player = graph.play_in_step(
         str(graph.folder / 'robot'), '--start-offset', '1.09', '--remap', '/rgb/image:=/camera/color',
-        '/depth/image:=/camera/depth', '/rgb/camera_info:=/camera/info', '--rate', 'max',
-        '--wait-for', '/robot/splatam/processed',
+        '/depth/image:=/camera/depth', '/rgb/camera_info:=/camera/info', processed='/robot/splatam/processed',
     )  # fmt: skip
     graph.spin_until(lambda: not node.is_running, explain=lambda: player.text + node.text)
     assert (player.wait(), node.wait()) == (0, 0), player.text + node.text
